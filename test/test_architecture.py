@@ -32,7 +32,8 @@ NUMBERS = ["numpy", "scipy", "numba"]
 STRANGERS = {
     "classes": [], "intensity": ["numpy"], "types": ["numpy"], "param_fields": [],
     "geometry": ["numpy", "numba"], "camera": NUMBERS,
-    "groups": ["numpy"], "robot": ["numpy", "scipy"], "runs": ["rich", "jinja2", "threadpoolctl"],
+    "groups": ["numpy"], "robot": ["numpy", "scipy"],
+    "runs": ["rich", "jinja2", "threadpoolctl", "numba"],
     "wire": ["numpy", "scipy", "rosbags", "msg_utils", "lz4", "zstandard"],
     "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils", "lz4", "zstandard"],
     "ground": [*NUMBERS, "pypatchworkpp"], "clustering": NUMBERS, "candidates": NUMBERS,

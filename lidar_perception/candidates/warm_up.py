@@ -12,10 +12,12 @@ from lidar_perception.candidates.seeds import seed_from_points
 from lidar_perception.clustering.euclidean import euclidean
 from lidar_perception.clustering.params import EuclideanParams
 from lidar_perception.param_fields import with_values
+from lidar_perception.runs.compiling import compilation_reported
 from lidar_perception.types import LidarFrame
 from lidar_perception.wire.params import ViewParams
 
 
+@compilation_reported()
 def warm_up() -> None:
     """Run every stage and method once on a few made-up points, so that compiled code is loaded (or
     built and cached, the first time) before the first message arrives."""

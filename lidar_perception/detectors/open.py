@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 from lidar_perception.detectors.contract import FUSED, Detector
 from lidar_perception.detectors.params import RANGE_CHOICES
 from lidar_perception.param_fields import with_values
+from lidar_perception.runs.compiling import compilation_reported
 from lidar_perception.types import InputError, unknown_name
 
 if TYPE_CHECKING:
@@ -44,10 +45,13 @@ class Configured(Detector, Protocol):
         """Return this detector with another range, see base.NetworkDetector."""
 
 
+@compilation_reported()
 def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
                   sensor_height: float | None = None, min_score: float | None = None,
                   range: str = "auto", settings: Mapping[str, Any] = {}) -> Configured:
     """Open a detector by its name or from a file of weights.
+
+    The first call on a machine compiles for a minute or two and reports it on standard error.
 
     Args:
         weights: name of a detector (fused, pointpillars or pointnet), with the weights that come

@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 
 from lidar_perception.detectors.contract import Found, joined
 from lidar_perception.detectors.params import NetworkParams
-from lidar_perception.nodes.main import one_at_a_time
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import DetectionOutputs
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
+from lidar_perception.runs.compiling import one_at_a_time
 from lidar_perception.runs.machine import cores
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.messages import cluster_column, column
@@ -71,7 +71,7 @@ class DetectorNode(ManagedNode):
                 chosen_device(device)
             except InputError as error:
                 device, missing = "cpu", f"{error}; the CPU is used"
-        with one_at_a_time():
+        with one_at_a_time(self.get_logger().info):
             detector = self.load(weights, device)
         detector.place.fallback = detector.fallback or missing
         return detector

@@ -7,15 +7,13 @@ only, and each function its own imports.
 
 from __future__ import annotations
 
-import fcntl
 import importlib
 import os
+import re
 import signal
 import sys
-import tempfile
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from itertools import pairwise
-from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -35,15 +33,6 @@ def help_text(name: str) -> str:
     lines = [f"Usage: {name} --ros-args [-p PARAMETER:=VALUE] [-r FROM:=TO] [--params-file YAML]",
              "", "Parameters:"]
     return "\n".join([*lines, *described(node_parameters(name))])
-
-
-@contextmanager
-def one_at_a_time():
-    """The first node compiles, the others wait and load what it has cached: when all compile the
-    same at once on few cores, each takes as many times longer."""
-    with open(Path(tempfile.gettempdir()) / f"lidar_perception-{os.getuid()}.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
 
 
 def run(name: str, arguments: list[str]) -> int:
@@ -70,11 +59,28 @@ def run(name: str, arguments: list[str]) -> int:
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
-    module = importlib.import_module(f"lidar_perception.nodes.{name}")
-    if hasattr(module, "warm_up"):
-        with one_at_a_time():
-            module.warm_up()
-    return _spin(getattr(module, NODES[name][0]), arguments, perf_counter() - begin, stop)
+    from rclpy.logging import get_logger
+
+    from lidar_perception.runs.compiling import compilation_reported, one_at_a_time
+    say = get_logger(_logger_name(arguments)).info
+    with compilation_reported(say):
+        module = importlib.import_module(f"lidar_perception.nodes.{name}")
+        if hasattr(module, "warm_up"):
+            with one_at_a_time(say):
+                module.warm_up()
+    return _spin(getattr(module, NODES[name][0]), arguments, begin, stop)
+
+
+def _logger_name(arguments: list[str]) -> str:
+    """Return the name under which ROS logs a node with these arguments, before there is the node.
+
+    The name after remapping, with its namespace; without a rule that of the executable.
+    """
+    rules = [b.rpartition(":__")[2].removeprefix("__").partition(":=")
+             for a, b in pairwise(arguments) if a in ("-r", "--remap")]
+    given = {key: value for key, _, value in rules if re.fullmatch(r"[A-Za-z_/][\w/]*", value)}
+    name = given.get("node") or given.get("name") or arguments[0]
+    return ".".join([*filter(None, given.get("ns", "").split("/")), name])
 
 
 def _misspelt_sections(arguments: list[str], node: str) -> list[str]:
@@ -97,11 +103,13 @@ def _leave(node: LidarNode) -> None:
     os._exit(0)
 
 
-def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) -> int:
+def _spin(node_class: type, arguments: list[str], begin: float, stop: Stop) -> int:
+    """Make the node and spin it. begin: perf_counter() at the start of the process."""
     import rclpy
     from rclpy.exceptions import NameValidationException, ParameterException
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.impl.implementation_singleton import rclpy_implementation
+    from rclpy.logging import get_logger
     from rclpy.signals import SignalHandlerOptions
 
     from lidar_perception.nodes.known import misspelt
@@ -110,6 +118,7 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
 
     RCLError = rclpy_implementation.RCLError
     UnknownROSArgsError = rclpy_implementation.UnknownROSArgsError
+    log = get_logger(_logger_name(arguments))
     node, code = None, 1
     kept: BaseException | None = None  # and with it what a refused node has made
     try:
@@ -128,16 +137,18 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
         if not node.stop.done():
             node.start()
         if not node.stop.done():
-            node.get_logger().info(f"ready: code loaded and warmed up in {seconds:.1f} s")
+            if node.is_ready():
+                node.get_logger().info("ready: code loaded and warmed up in "
+                                       f"{perf_counter() - begin:.1f} s")
             executor = SingleThreadedExecutor()
             executor.add_node(node)
             node.spin(executor)
         code = 0
     except UnknownROSArgsError as error:
-        rclpy.logging.get_logger(node_class.__name__).fatal(f"unknown after --ros-args: {error}")
+        log.fatal(f"unknown after --ros-args: {error}")
         kept, code = error, 2
     except (InputError, ValueError, ParameterException, NameValidationException, RCLError) as error:
-        rclpy.logging.get_logger(node_class.__name__).fatal(" ".join(str(error).split()))
+        log.fatal(" ".join(str(error).split()))
         kept, code = error, 2
     finally:
         stop.closing()

@@ -15,6 +15,7 @@ from rclpy.node import Node
 
 from lidar_perception.nodes.runtime import ERROR, OK, WAITING, WARN, LidarNode
 from lidar_perception.nodes.transforms import Transforms
+from lidar_perception.runs.compiling import compilation_reported
 from lidar_perception.runs.files import refusals_named
 from lidar_perception.types import InputError
 
@@ -61,7 +62,11 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
 
     def _configure(self) -> None:
         self.transforms = Transforms(self)
-        self.configure()
+        with compilation_reported(self.get_logger().info):
+            self.configure()
+
+    def is_ready(self) -> bool:
+        return self.state_label() == "active"
 
     def start(self) -> None:
         if not self.robot.autostart:
@@ -72,6 +77,8 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         begin = monotonic()
         if (self.state_label() == "inactive" or self.trigger_configure() == SUCCESS) and (
                 self.trigger_activate() == SUCCESS):
+            if self._retry_at is not None:
+                self.get_logger().info("ready")
             self._retry_at = None
         else:
             now = monotonic()
@@ -132,7 +139,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         before = self.state
         if problem := self._problem_of(self._configure):
             self._forget_configuration()
-            self.report(ERROR, f"{UNCONFIGURED}, so nothing comes of this node: {problem}")
+            self.report(ERROR, f"{UNCONFIGURED}, so this node publishes nothing: {problem}")
             return FAILURE
         if self.state == before:
             self.state = (OK, INACTIVE)

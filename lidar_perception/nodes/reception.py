@@ -28,6 +28,16 @@ TRY_AGAIN = 5.0       # seconds between trials where waiting was in vain,
 TRIAL = 0.3           # and how long one takes
 RATE_OF = 10          # intervals, of which the present rate is the mean
 SILENT, STALLED = 3.0, 6.0  # periods without a cloud that are no ERROR, or not STALE, yet
+# Kind of publisher -> what to ask when nothing comes, and when too little does.
+QUESTIONS = {
+    "sensor": ("is the sensor{} running, and connected?", "is the sensor{} overloaded?"),
+    "detector": ("is the detector{} running, and does it get clouds?",
+                 "is the detector{} overloaded, or does it get fewer clouds?"),
+    "node": ("is the node{} running, and does it get clouds?",
+             "is the node{} overloaded, or does it get fewer clouds?"),
+    "player": ("has the player{} reached the end of its bag, or is it paused?",
+               "does the player{} play more slowly?"),
+}
 PROFILE = files("lidar_perception.nodes") / "fastdds.xml"
 
 Problem = tuple[str, bytes, str]  # kind, level, message
@@ -266,7 +276,7 @@ class Reception:
         expected, rate = self.expected(), self.arrivals.rate()
         if expected and rate and rate < params.min_rate * expected:
             found.append(("rate", WARN, f"{rate:.1f} {self.what}s a second on {self.topic} where "
-                          f"{expected:.1f} are expected (input.rate): is the sensor overloaded?"))
+                          f"{expected:.1f} are expected (input.rate): {self._questions()[1]}"))
         sent, lost, dropped = self.arrivals.recent()
         enough = max(sent, SHARE_OF)  # one of the first two clouds is no half of them
         if lost > params.max_lost * enough:
@@ -289,7 +299,19 @@ class Reception:
             return None
         kind, level, limit = ("stale", STALE, stale) if silent > stale else ("silent", ERROR, error)
         return (kind, level, f"no {self.what} on {self.topic} for more than {round(limit, 1):g} s: "
-                "is the sensor running, and connected?")
+                f"{self._questions()[0]}")
+
+    def _questions(self) -> list[str]:
+        """Return QUESTIONS about the publishers, by their kind and names."""
+        names = sorted({_name(p) for p in self.met})
+        if names and all(name.endswith("_player") for name in names):
+            kind = "player"  # bag_player, rosbag2_player
+        elif self.what != "cloud":
+            kind = "detector"
+        else:  # topics of our own stages are NODE/output/points
+            kind = "node" if self.topic.endswith("/output/points") else "sensor"
+        return [question.format(f" {', '.join(names)}" if names else "")
+                for question in QUESTIONS[kind]]
 
     def _unheard(self, publishers: list[Any]) -> Problem | None:
         """A best-effort publisher, where adapt() may not make the subscription fit it."""

@@ -16,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -28,7 +29,7 @@ from std_msgs.msg import Float64
 from lidar_perception.nodes.declared import as_declared, declare
 from lidar_perception.nodes.reception import Problem, Reception
 from lidar_perception.param_fields import flatten, with_values
-from lidar_perception.types import InputError
+from lidar_perception.types import InputError, closest_name
 from lidar_perception.wire.codec import bag_message, decode, encode, typestore
 from msg_utils.messages import message_class
 
@@ -44,6 +45,17 @@ JUMP_NS = 10**9  # stamps that go back by more than this are a bag that starts a
 WAITING = "waiting for input"
 LOG_PERIOD = 60.0  # seconds before the same problem is logged again
 MAX_KINDS = 1000   # of messages whose last time is known
+
+
+class UnknownParameter(ParameterNotDeclaredException):
+    """A parameter that is set but not declared; rclpy catches it, and answers with its message.
+
+    rclpy 7's own message is "Invalid access to undeclared parameter(s): []", because any() has
+    taken the name from a generator (rclpy/node.py, _check_undeclared_parameters).
+    """
+
+    def __init__(self, message: str):
+        Exception.__init__(self, message)
 
 
 class LidarNode(Node):
@@ -96,9 +108,17 @@ class LidarNode(Node):
     def start(self) -> None:
         """Called once, when the node is made and before it spins."""
 
+    def is_ready(self) -> bool:
+        """Return True once the node works on its input."""
+        return True
+
     def _before_set(self, changes: list[Parameter]) -> list[Parameter]:
-        return [as_declared(c, self.get_parameter(c.name).type_)
-                if self.has_parameter(c.name) else c for c in changes]
+        if unknown := [c.name for c in changes if not self.has_parameter(c.name)]:
+            guess = closest_name(unknown[0], self._parameters)
+            raise UnknownParameter(f"{self.get_fully_qualified_name()} has no parameter "
+                                   f"{unknown[0][:80]!r}" + (f"; did you mean {guess!r}?"
+                                                             if guess else ""))
+        return [as_declared(c, self.get_parameter(c.name).type_) for c in changes]
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
         try:

@@ -204,6 +204,8 @@ def test_a_node_without_its_network_waits_for_the_file_and_says_so(nodes, peer, 
         assert state(peer, driven) == State.PRIMARY_STATE_UNCONFIGURED
     for node in (driven, alone):
         peer.wait_for_diagnostics(node, reason, level=2)
+        peer.wait(lambda n=node: peer.value_of(n, "lifecycle") == "unconfigured", "the state")
+        assert "ready" not in nodes.log(node.replace("/", "."))
     part = later.with_name("part")
     part.write_bytes(weights.read_bytes())
     part.rename(later)
@@ -213,7 +215,8 @@ def test_a_node_without_its_network_waits_for_the_file_and_says_so(nodes, peer, 
         found = peer.listen(f"/{node}/output/detections", MARKERS)
         peer.send(talker, message(1), lambda f=found: received(f, 1), "detections")
         assert_equal(received(found, 1), offline(weights, message(1)))
-    assert nodes.log(f"tries.{NODE}").count(reason) == 1
+    log = nodes.log(f"tries.{NODE}")
+    assert log.count(reason) == 1 and log.index(reason) < log.index(": ready")
 
 
 def test_a_template_that_is_missing_is_known_before_the_first_cloud(nodes, peer):

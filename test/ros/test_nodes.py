@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.parameter import Parameter, parameter_value_to_python
 
 from lidar_perception.candidates.params import PipelineParams
@@ -122,6 +123,7 @@ ARGUMENTS = {"-p foo": "-p foo", "--params-file /nope.yaml": "/nope.yaml",
 
 
 def test_arguments_that_ros_does_not_take_are_one_line_and_exit_code_2(domain):
+    """The line names the node as ROS does."""
     program = '''
 import sys
 from time import sleep
@@ -130,7 +132,8 @@ from lidar_perception.nodes import bag_player, main, perception
 stop = SimpleNamespace(closing=lambda: None, closed=lambda code: None)
 for given in sys.argv[1:]:
     kind = bag_player.BagPlayer if "bag" in given else perception.Perception
-    print(main._spin(kind, ["x", "--ros-args", *given.split()], 0.0, stop), flush=True)
+    arguments = ["x", "--ros-args", "-r", "__node:=front", "-r", "__ns:=/left", *given.split()]
+    print(main._spin(kind, arguments, 0.0, stop), flush=True)
     print("---", file=sys.stderr, flush=True)
 '''
     done = subprocess.run([sys.executable, "-c", program, *ARGUMENTS], text=True,
@@ -138,7 +141,16 @@ for given in sys.argv[1:]:
     assert done.stdout.split() == ["2"] * len(ARGUMENTS)
     for words, said in zip(ARGUMENTS.values(), done.stderr.split("---\n"), strict=False):
         fatal, = [line for line in said.splitlines() if "[FATAL]" in line]
-        assert words in fatal and "Traceback" not in said
+        assert words in fatal and "[left.front]: " in fatal and "Traceback" not in said
+
+
+def test_parameter_that_a_node_does_not_have_is_named(start):
+    """rclpy says: undeclared parameter(s): []."""
+    node = start(GroundSegmentation)
+    for name, words in (("input.queu", "no parameter 'input.queu'; did you mean 'input.queue'?"),
+                        ("zzz", "/ground_segmentation has no parameter 'zzz'$")):
+        with pytest.raises(ParameterNotDeclaredException, match=words):
+            node.set_parameters_atomically([Parameter(name, value=1)])
 
 
 def test_bad_parameter_files_are_refused_in_one_line(processes):

@@ -271,6 +271,29 @@ def test_who_has_lost_clouds_is_named_when_it_is_gone_as_before(start, monkeypat
         assert "let /driver publish reliable" in said
 
 
+@pytest.mark.parametrize("topic, what, publisher, silent, slow", [
+    ("/velodyne_points", "cloud", "driver", "is the sensor /driver running", "is the sensor /dri"),
+    ("/velodyne_points", "cloud", "", "is the sensor running, and connected?", "sensor overloaded"),
+    ("/points", "cloud", "rosbag2_player", "has the player /rosbag2_player reached", "more slowly"),
+    ("/clustering/output/points", "cloud", "clustering", "is the node /clustering running",
+     "is the node /clustering overloaded"),
+    ("/fused_detector/output/detections", "array", "fused_detector",
+     "is the detector /fused_detector running, and does it get clouds?", "is the detector /fused"),
+    ("/boxes", "array", "", "is the detector running", "is the detector overloaded")])
+def test_problem_names_the_kind_of_publisher(monkeypatch, topic, what, publisher, silent, slow):
+    late = Late(monkeypatch, lambda stamp: 0.0, rate=10.0)
+    late.reception.topic, late.reception.what = topic, what
+    late.reception.met = [SimpleNamespace(node_namespace="/", node_name=publisher)
+                          ] * bool(publisher)
+    late.reception.last_time, late.now = 1.0, 4.0
+    said, = (text for _, _, text in late.reception.problems())
+    assert said.startswith(f"no {what} on {topic} for more than 2 s: ") and silent in said
+    late.now = 1.0
+    monkeypatch.setattr(late.reception.arrivals, "rate", lambda: 3.0)
+    said, = (text for _, _, text in late.reception.problems())
+    assert slow in said and ("sensor" in said) == (topic == "/velodyne_points")
+
+
 class Late:
     """A Reception of clouds at 10 Hz, each of whose poses comes lag(stamp) seconds after it; in a
     time that is made up. answered: (stamp, whether it had its pose)."""

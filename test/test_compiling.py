@@ -1,0 +1,59 @@
+"""The first compilation on a machine is reported, and waited for by other processes."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import tempfile
+import threading
+
+import pytest
+from numba import njit
+
+from lidar_perception.runs import compiling
+from lidar_perception.runs.compiling import compilation_reported, one_at_a_time
+
+
+@pytest.fixture
+def patience(monkeypatch):
+    """Every compilation and every wait is long."""
+    monkeypatch.setattr(compiling, "PATIENCE", 0.0)
+    monkeypatch.setattr(compiling, "TICK", 0.001)
+
+
+def test_compilation_is_reported_by_the_outermost_block(patience, capsys):
+    lines = []
+    with compilation_reported(lines.append), compilation_reported(lambda _: pytest.fail("twice")):
+        assert njit(lambda x: x + 1)(1) == 2
+    assert lines[0] == compiling.COMPILING and "compiled " in lines[-1]
+    with compilation_reported():  # again, and on standard error
+        njit(lambda x: x + 2)(1)
+    captured = capsys.readouterr()
+    assert compiling.COMPILING in captured.err and captured.out == ""
+
+
+def test_what_is_compiled_already_is_not_reported(monkeypatch):
+    function = njit(lambda x: x + 1)
+    function(1)
+    monkeypatch.setattr(compiling, "PATIENCE", 1e-9)
+    monkeypatch.setattr(compiling, "TICK", 0.001)
+    with compilation_reported(pytest.fail):
+        assert function(1) == 2
+        threading.Event().wait(0.01)  # the reporter has looked
+
+
+def test_wait_for_another_process_is_reported(patience, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    lines = []
+    with open(tmp_path / f"lidar_perception-{os.getuid()}.lock", "w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+
+        def say(line):
+            lines.append(line)
+            other.close()  # it is done
+
+        with one_at_a_time(say):
+            pass
+    assert lines[0] == compiling.WAITING and lines[1].startswith("waited ")
+    with one_at_a_time(pytest.fail):  # it is free
+        pass
