@@ -60,7 +60,8 @@ REPLACED = ("drive", "result", "logs")    # by the next demo
 
 def _runs(detector: str) -> Runs:
     """The detector that the nodes run, with its parameters."""
-    return candidates_run() if detector == CANDIDATES else runs_of(detector)
+    return (candidates_run(on_messages=True) if detector == CANDIDATES else
+            runs_of(detector, on_messages=True))
 
 
 @click.command(cls=Command)

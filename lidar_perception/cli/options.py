@@ -8,36 +8,30 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import Field, dataclass, fields
-from itertools import count
 from pathlib import Path
 from typing import Any
 
 import click
-import yaml
 
 from lidar_perception.candidates.configurations import CONFIGURATIONS, PAPER
 from lidar_perception.cli.command import Choice, HelpfulOption
+from lidar_perception.cli.parameter_files import Fields, read_parameters
 from lidar_perception.detectors.contract import FUSED
 from lidar_perception.detectors.open import DetectorChoice, default_params
 from lidar_perception.detectors.params import RANGE_CHOICES
 from lidar_perception.nodes import NODES
-from lidar_perception.nodes.known import misspelt, node_parameters
+from lidar_perception.nodes.known import node_parameters
 from lidar_perception.param_fields import described, parameter_fields, with_values
-from lidar_perception.runs.files import read_text, short
 from lidar_perception.runs.terminal import errors
 from lidar_perception.tracking.params import TrackingParams
-from lidar_perception.types import InputError, closest_name, did_you_mean, valid_names
+from lidar_perception.types import InputError, did_you_mean
 
-MAX_BYTES, MAX_NAMES = 10**6, 10_000  # of a parameter file; aliases in YAML make many of few bytes
-MAX_DEPTH = 20  # groups in each other
 CANDIDATES = "candidates"
 CANDIDATE_NODES = "perception", "ground_segmentation", "clustering", "candidate_refinement"
 ON_OFF = {"true": True, "yes": True, "on": True, "1": True,
           "false": False, "no": False, "off": False, "0": False}
-
-Fields = Mapping[str, Field[Any]]
 
 
 @dataclass(frozen=True)
@@ -66,13 +60,19 @@ class Settings:
         known = {name: f for each in runs for name, f in each.fields.items()}
         whose = " or ".join(dict.fromkeys(each.name for each in runs))
         for name, _ in self.given:
+            if name not in known and name.startswith("input."):
+                raise InputError(f"{name} is for messages, which nodes read; the intensities of a "
+                                 "recording have a scale of their own")
             if name not in known:
-                raise InputError(f"{whose} has no parameter {name[:80]!r}{_guess(name, known)} "
-                                 "(--set help lists them all)")
-        found = [{} if self.config is None else
-                 read_config(self.config, each.fields, each.nodes) for each in runs]
-        if self.config is not None and not any(found):
-            errors.print(f"{self.config} has no parameter of {whose}", style="yellow")
+                raise InputError(f"there is no parameter {name[:80]!r} of {whose}"
+                                 f"{_guess(name, known)} (--set help lists them all)")
+        found: list[dict[str, Any]] = [{} for _ in runs]
+        if self.config is not None:
+            read = [read_parameters(self.config, each.fields, each.nodes) for each in runs]
+            found = [values for values, _ in read]
+            _warn(self.config, (line for _, lines in read for line in lines))
+            if not any(found):
+                errors.print(f"{self.config} has no parameter of {whose}", style="yellow")
         return [{**values, **{name: _value(name, each.fields[name], text)
                               for name, text in self.given if name in each.fields}}
                 for each, values in zip(runs, found)]
@@ -162,16 +162,16 @@ def settings_options(runs: Callable[[Mapping[str, Any]], list[Runs]]) -> Callabl
     return decorate
 
 
-def candidates_run(params: Any = PAPER) -> Runs:
-    """The pipeline of the STM-CPA paper, with these defaults."""
-    return Runs(CANDIDATES, parameter_fields(params), CANDIDATE_NODES)
+def candidates_run(on_messages: bool = False) -> Runs:
+    """The pipeline of the STM-CPA paper; on_messages: in nodes."""
+    return Runs(CANDIDATES, _read_here(parameter_fields(PAPER), on_messages), CANDIDATE_NODES)
 
 
 def parameter_options(defaults: Any, name: str = CANDIDATES,
                       nodes: Collection[str] | None = CANDIDATE_NODES) -> Callable:
     """Decorator: --config and --set of one dataclass of parameters, which the function gets as
     params=."""
-    runs = Runs(name, parameter_fields(defaults), nodes)
+    runs = Runs(name, _read_here(parameter_fields(defaults), on_messages=False), nodes)
 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
@@ -195,13 +195,19 @@ def weights_of(given: Mapping[str, Any]) -> list[str]:
     return [*map(str, weights)] if isinstance(weights, tuple) else [str(weights)]
 
 
-def runs_of(weights: str | Path) -> Runs:
-    """A detector that runs, by its name or its file of weights. InputError for an unknown one."""
+def runs_of(weights: str | Path, on_messages: bool = False) -> Runs:
+    """A detector that runs, by its name or its file of weights; on_messages: in a node. InputError
+    for an unknown one."""
     params = default_params(weights)
     name = str(weights)
     node = next((f"{f.name}_detector" for f in fields(params)
                  if f"{f.name}_detector" in NODES), name)
-    return Runs(name, parameter_fields(params), (node,))
+    return Runs(name, _read_here(parameter_fields(params), on_messages), (node,))
+
+
+def _read_here(fields: Fields, on_messages: bool) -> Fields:
+    """Without the parameters of how messages are read, where there are none."""
+    return {name: f for name, f in fields.items() if on_messages or not name.startswith("input.")}
 
 
 @dataclass(frozen=True)
@@ -304,91 +310,14 @@ def weights_option(default: str | None = None, multiple: bool = False) -> Callab
 
 
 def read_config(path: Path, known: Any, nodes: Collection[str] | None = None) -> dict[str, Any]:
-    """Read the values of a ROS parameter file, or of a named configuration of the candidates.
-
-    Args:
-        path: file, or a name of CONFIGURATIONS.
-        known: a dataclass of parameters, or its fields; other parameters are left out.
-        nodes: names of the nodes whose sections apply, and those for all nodes; None: all
-            sections.
-
-    Returns:
-        {dotted name: value}, not checked yet.
-
-    Raises:
-        InputError: the file cannot be read, or a name in it is on the wrong level.
-    """
-    known = known if isinstance(known, Mapping) else parameter_fields(known)
-    if str(path) in CONFIGURATIONS:
-        values = CONFIGURATIONS[str(path)]
-        if others := sorted(values.keys() - known.keys()):
-            raise InputError(f"the configuration {path} is for candidates; there is no "
-                             f"{others[0]} here, give a parameter file")
-        return dict(values)
-    content = _loaded(path)
-    values, visited, others = {}, count(), []
-    for node, section in content.items():
-        if not (isinstance(section, dict)
-                and isinstance(section.get("ros__parameters", ()), dict | None)):
-            raise InputError(f"{path}: '{node}' has no ros__parameters; see config/ for the form")
-        if nodes is not None and not _applies(path, str(node), nodes):
-            continue
-        for name, value in _dotted(path, section.get("ros__parameters") or {}, visited):
-            if not isinstance(name, str):
-                raise InputError(f"{path}: {name!r} is no name of a parameter; put it into quotes")
-            if name in known:
-                values[name] = value
-            elif any(k.startswith(f"{name}.") or name.startswith(f"{k}.") for k in known):
-                raise InputError(f"{path}: '{name}' is {_wrong_level(name, known)}")
-            else:
-                others.append(name)
-    for line in misspelt(others):
-        errors.print(f"{path}: {line}")
+    """Read a parameter file, see read_parameters, and print what may be misspelt in it. known: a
+    dataclass of parameters, or its fields."""
+    fields = known if isinstance(known, Mapping) else parameter_fields(known)
+    values, lines = read_parameters(path, fields, nodes)
+    _warn(path, lines)
     return values
 
 
-def _loaded(path: Path) -> dict[Any, Any]:
-    """The content of a parameter file. InputError where it cannot be read."""
-    if not path.exists():
-        raise InputError(f"cannot read the parameter file {path}: there is no such file"
-                         + valid_names(str(path), CONFIGURATIONS))
-    try:
-        content = yaml.safe_load(read_text(path, MAX_BYTES))
-    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
-        raise InputError(f"cannot read the parameter file {path}: {short(error)}") from None
-    if not isinstance(content, dict | None):
-        raise InputError(f"{path} is no parameter file; see config/ for the form")
-    return content or {}
-
-
-def _applies(path: Path, section: str, nodes: Collection[str]) -> bool:
-    """Return True for a section for one of these nodes, or for all nodes."""
-    name = section.rpartition("/")[2]
-    if name in ("*", "**") or name in nodes:
-        return True
-    if name not in NODES and (guess := closest_name(name, nodes)):
-        errors.print(f"{path}: no node is called {name[:80]!r}; did you mean {guess!r}?",
-                     style="yellow")
-    return False
-
-
-def _wrong_level(name: str, known: Iterable[str]) -> str:
-    inner = [k for k in known if k.startswith(f"{name}.")]
-    return (f"a group, not a value; it holds {', '.join(inner)}" if inner else
-            "below a parameter that holds no others")
-
-
-def _dotted(path: Path, section: dict, visited: Iterator[int], prefix: str = "",
-            depth: int = 0) -> Iterator[tuple[Any, Any]]:
-    """(dotted name, value); the name as it is where it is no text. visited counts all that is
-    looked at, as groups may be empty, and may be in each other by their anchors."""
-    for key, value in section.items():
-        if next(visited) >= MAX_NAMES or depth >= MAX_DEPTH:
-            raise InputError(f"{path} has more than {MAX_NAMES} parameters, or groups in more than "
-                             f"{MAX_DEPTH} others")
-        if not isinstance(key, str):
-            yield key, value
-        elif isinstance(value, dict):
-            yield from _dotted(path, value, visited, f"{prefix}{key}.", depth + 1)
-        else:
-            yield f"{prefix}{key}", value
+def _warn(path: Path, lines: Iterable[str]) -> None:
+    for line in dict.fromkeys(lines):
+        errors.print(f"{path}: {line}", style="yellow")

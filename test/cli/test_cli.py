@@ -20,10 +20,11 @@ from samples import LABELS, WALKER, lowered_crowd, object_folder, walker_label, 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.cli import info
+from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import opened
 from lidar_perception.cli.demo import _as_replayed, _params_of
 from lidar_perception.cli.main import COMMANDS, cli
-from lidar_perception.cli.options import read_config
+from lidar_perception.cli.options import detector_options, read_config
 from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.open import DetectorChoice
@@ -110,6 +111,7 @@ def test_every_command_has_a_docstring(name):
 @pytest.mark.parametrize(("words", "names"), [
     (("evaluate", "candidates"), ["stm.threshold (default 0.4)", "ground.method (default 'thr"]),
     (("evaluate", "detection", "--weights", "pointnet"), ["pointnet.scores.car (default 0.4)"]),
+    (("evaluate", "clusters"), ["ground.method (default 'cloth')"]),
     (("evaluate", "tracking"), ["fused.same_place (default 0.6 m)", "tracking.min_score (defa"]),
     (("demo", "--detector=candidates"), ["view.enabled (default True)"])], ids=str)
 def test_set_help_lists_the_parameters_of_what_runs(words, names):
@@ -121,7 +123,7 @@ def test_set_help_lists_the_parameters_of_what_runs(words, names):
 def test_set_help_of_candidates_describes_every_parameter():
     text = run("evaluate", "candidates", "--set", "help")
     assert all(f"{name} (default" in text and f.metadata["doc"] in text
-               for name, f in parameter_fields(PAPER).items())
+               for name, f in parameter_fields(PAPER).items() if not name.startswith("input."))
 
 
 def test_convert_makes_a_bag_of_every_scan(kitti, bag):
@@ -392,6 +394,66 @@ def test_a_parameter_that_is_misspelt_is_said_and_those_of_others_are_not(tmp_pa
     assert ".heigth', so it changes nothing; is 'ground.sensor_pose.height' meant" in said
 
 
+SECTIONS = """
+/**:
+  ros__parameters: {ground: {method: threshold}, base_frame: base_link, other: {x: 1}}
+fused_detector:
+  ros__parameters: {fused: {scores: {car: 0.7}}, crop: {min_range: 2.0}}
+/robot/pointnet_detector:
+  ros__parameters: {crop: {min_range: 9.0}, pointnet: {min_points: 5}}
+tracker:
+  ros__parameters: {tracking: {min_score: 0.3}}
+somebody_elses_node:
+  ros__parameters: {fused: {scores: {cyclist: 0.9}}}
+"""
+
+
+def chosen(*arguments, tracking=False) -> dict:
+    """What a verb with detector_options gets."""
+    made = {}
+
+    @click.command(cls=Command)
+    @detector_options(tracking=tracking)
+    def verb(**given):
+        made.update(given)
+    verb.main([*map(str, arguments)], standalone_mode=False)
+    return made
+
+
+def test_only_the_sections_of_what_runs_are_read(tmp_path, capsys):
+    file = write(tmp_path / "p.yaml", SECTIONS)
+    made = chosen("--config", file, "--set", "crop.min_range=3", tracking=True)
+    assert made["detector"].settings == {"ground.method": "threshold", "fused.scores.car": 0.7,
+                                         "crop.min_range": 3.0}
+    assert made["tracking"].min_score == 0.3
+    other = chosen("--weights", "pointnet", "--config", file)["detector"]
+    assert other.settings == {"ground.method": "threshold", "crop.min_range": 9.0,
+                              "pointnet.min_points": 5}
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("text", "said"), [
+    ("fused_detectr: {ros__parameters: {}}", "no node 'fused_detectr'; did you mean 'fused_detec"),
+    ("/**: {ros__parameters: {fused.score.car: 1}}", "is 'fused.scores.car' meant?"),
+    ("/**: {ros__parameters: {a: 1}}", "p.yaml has no parameter of fused")])
+def test_what_may_be_misspelt_in_a_parameter_file_is_said(text, said, tmp_path, capsys):
+    file = write(tmp_path / "p.yaml", text)
+    assert chosen("--config", file)["detector"].settings == {}
+    assert said in capsys.readouterr().err
+
+
+def test_settings_of_a_detector_take_effect_and_win():
+    """Over the threshold and the height that a verb gives, and in what is loaded."""
+    made = chosen("--weights", "pointpillars", *given(
+        "pointpillars.scores.car=0.7", "pointpillars.range=around", "pointpillars.device=cpu",
+        "pointpillars.warm_up=no"))["detector"]
+    detector = made.open(sensor_height=1.0, min_score=0.001)
+    assert detector.min_scores == {"Car": 0.7, "Pedestrian": 0.001, "Cyclist": 0.001}
+    assert detector.config.low[0] < 0 and detector.params.ground.sensor_pose.height == 1.0
+    with pytest.raises(InputError, match="give one of them"):
+        DetectorChoice("f.json", settings={"fused.weights": "a"}).open()
+
+
 def test_a_pipe_is_no_parameter_file_and_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="is no file"):
@@ -480,6 +542,7 @@ def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch,
     (["evaluate", "candidates", "--data", "b", "--set", "stm.threshold"], "must be NAME=VALUE"),
     (["evaluate", "detection", "--data", "b", "--set", "fused.score.car=1"],
      "did you mean 'fused.scores.car'?"),
+    (["detect", "b", "--out", "o", "--set", "input.intensity_max=255"], "which nodes read"),
     (["evaluate", "detection", "--data", "b", "--set", "scores=1"], "no parameter 'scores'"),
     (["evaluate", "detection", "--data", "b", "--results", "r", "--set", "fused.amp=auto"],
      "give either --results"),

@@ -75,9 +75,9 @@ def test_what_demo_did_not_make_stays(drive_bag, make_bag, tmp_path):
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["--config", "best"], "the configuration best is for candidates"),
-    (["--set", "stm.threshold=0.5"], "fused has no parameter 'stm.threshold'"),
+    (["--set", "stm.threshold=0.5"], "there is no parameter 'stm.threshold' of fused"),
     (["--ground-method", "cloth"], "--set ground.method=VALUE"),
-    (["--detector", "candidates", "--set", "fused.proposals=0.1"], "candidates has no parameter")])
+    (["--detector", "candidates", "--set", "fused.proposals=0.1"], "of candidates")])
 def test_demo_refuses_parameters_of_another_detector(tmp_path, monkeypatch, capsys, arguments,
                                                      words):
     assert exit_of(monkeypatch, "demo", *arguments, "--out", tmp_path / "out") == 2

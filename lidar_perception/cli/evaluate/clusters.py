@@ -9,20 +9,33 @@ import click
 
 from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import Walk, a_path, no_labels, walk_options
+from lidar_perception.cli.options import Runs, Settings, checked, settings_options
+from lidar_perception.detectors.open import default_params
+from lidar_perception.detectors.pointnet.weights_file import WEIGHTS
+from lidar_perception.param_fields import parameter_fields
 from lidar_perception.runs.terminal import console
+
+
+def _runs(weights: Path | None) -> Runs:
+    """Ground and clustering, with the parameters that the network was trained with."""
+    fields = parameter_fields(default_params(weights or WEIGHTS))
+    return Runs("ground and clustering", {name: f for name, f in fields.items()
+                                 if name.startswith(("ground.", "clustering."))},
+                ("pointnet_detector",))
 
 
 @click.command(cls=Command)
 @walk_options()
 @a_path("--weights", "Checkpoint of a cluster network. Default: the one that comes with the "
         "package.")
-def clusters(walk: Walk, weights: Path | None) -> None:
+@settings_options(lambda given: [_runs(given.get("weights"))])
+def clusters(walk: Walk, weights: Path | None, settings: Settings) -> None:
     """Classes that the cluster network (PointNet) assigns to clusters and their points.
 
-    Clusters are made as for its training. A cluster is an object if at least half of its points lie
-    in the object's box, and background if less than 15 percent lie in any; the others do not count,
-    nor do Van, Truck, Tram, Person_sitting and DontCare regions. Only points in
-    the image count, as labels end there; without a camera all do.
+    Clusters are made as for its training, unless --config or --set change that. A cluster is an
+    object if at least half of its points lie in the object's box, and background if less than 15
+    percent lie in any; the others do not count, nor do Van, Truck, Tram, Person_sitting and
+    DontCare regions. Only points in the image count, as labels end there; without a camera all do.
 
     \b
     Example:
@@ -31,14 +44,15 @@ def clusters(walk: Walk, weights: Path | None) -> None:
     from lidar_perception.data.frame import BOXES
     from lidar_perception.detectors.checkpoint import read_header
     from lidar_perception.detectors.pointnet.config import PointNetConfig
-    from lidar_perception.detectors.pointnet.weights_file import WEIGHTS
     from lidar_perception.scoring.points.cluster_tables import print_cluster_scores
     from lidar_perception.scoring.points.clusters import ClusterScores, by_network
 
     file = weights or WEIGHTS
+    values, = settings.values(_runs(weights)) if settings else [{}]
+    checked(default_params(file), values)
     scores = ClusterScores(read_header(file, PointNetConfig).config.classes)
     recording = walk.opened(BOXES)
-    walk.fill(scores, recording, partial(by_network, file))
+    walk.fill(scores, recording, partial(by_network, file, values))
     if not scores.frames:
         raise no_labels(recording, scores.skipped)
     content = {"source": str(weights or "the package's own"), **scores.compute()}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -14,11 +14,13 @@ from lidar_perception.camera import Camera
 from lidar_perception.classes import DONT_CARE, TABLE
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.detectors.open import default_params
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
 from lidar_perception.detectors.pointnet.network import fused, load_pointnet
 from lidar_perception.detectors.pointnet.predict import Predictions, predict
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.segment import segment_ground
+from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, GroundTruth
 
 UNKNOWN = -1              # a label of which nothing is said
@@ -104,19 +106,25 @@ def confusions(clusters: Clusters, labels: np.ndarray, predictions: Predictions,
     return of_clusters, of_points
 
 
-def by_network(weights: Path, recording: Recording) -> Callable[[Frame], Any]:
-    """Runs a cluster network on every frame with labelled boxes, on its points in the image. With
-    weights a Start of scoring.run."""
+def by_network(weights: Path, settings: Mapping[str, Any],
+               recording: Recording) -> Callable[[Frame], Any]:
+    """Run a cluster network on every frame with labelled boxes, on its points in the image. With
+    the first arguments a Start of scoring.run.
+
+    settings: parameters of ground and clustering by their dotted names, where they are not those
+    that the network was trained with.
+    """
     network = fused(load_pointnet(weights)[1])
     config, background = network.config, len(network.config.classes)
+    params = with_values(default_params(weights), settings)
 
     def measure(frame: Frame) -> tuple[np.ndarray, np.ndarray] | None:
         truth = frame.truth()
         if truth is None:
             return None
         scan = frame.load()
-        ground = segment_ground(scan, config.ground)
-        ids = cluster_obstacles(scan.xyz, ground, config.clustering)
+        ground = segment_ground(scan, params.ground)
+        ids = cluster_obstacles(scan.xyz, ground, params.clustering)
         camera = frame.camera()
         if camera is None:  # then all around is labelled
             indices, hidden = np.arange(len(scan)), lambda xyz: np.zeros(len(xyz), bool)

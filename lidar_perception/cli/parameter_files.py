@@ -1,0 +1,111 @@
+"""ROS parameter files, as commands read them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import Field
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lidar_perception.candidates.configurations import CONFIGURATIONS
+from lidar_perception.nodes import NODES
+from lidar_perception.nodes.known import misspelt
+from lidar_perception.runs.files import read_text, short
+from lidar_perception.types import InputError, did_you_mean, valid_names
+
+MAX_BYTES, MAX_NAMES = 10**6, 10_000  # of a parameter file; aliases in YAML make many of few bytes
+MAX_DEPTH = 20  # groups in each other
+
+Fields = Mapping[str, Field[Any]]
+
+
+def read_parameters(path: Path, known: Fields, nodes: Collection[str] | None = None
+                    ) -> tuple[dict[str, Any], list[str]]:
+    """Read the values of a ROS parameter file, or of a named configuration of the candidates.
+
+    Args:
+        path: file, or a name of CONFIGURATIONS.
+        known: fields of the parameters to read, by dotted name; others are left out.
+        nodes: names of the nodes whose sections apply, and those for all nodes; None: all
+            sections.
+
+    Returns:
+        {dotted name: value}, not checked yet, and a line for each name that may be misspelt.
+
+    Raises:
+        InputError: the file cannot be read, or a name in it is on the wrong level.
+    """
+    if str(path) in CONFIGURATIONS:
+        named = CONFIGURATIONS[str(path)]
+        if others := sorted(named.keys() - known.keys()):
+            raise InputError(f"the configuration {path} is for candidates; there is no "
+                             f"{others[0]} here, give a parameter file")
+        return dict(named), []
+    content = _loaded(path)
+    visited = count()
+    values: dict[str, Any] = {}
+    lines: list[str] = []
+    unknown: list[str] = []
+    for node, section in content.items():
+        if not (isinstance(section, dict)
+                and isinstance(section.get("ros__parameters", ()), dict | None)):
+            raise InputError(f"{path}: '{node}' has no ros__parameters; see config/ for the form")
+        if nodes is not None and not _applies(str(node), nodes):
+            name = str(node).rpartition("/")[2]
+            if name not in NODES and (guess := did_you_mean(name, nodes)):
+                lines.append(f"there is no node {name[:80]!r}{guess}")
+            continue
+        for name, value in _dotted(path, section.get("ros__parameters") or {}, visited):
+            if not isinstance(name, str):
+                raise InputError(f"{path}: {name!r} is no name of a parameter; put it into quotes")
+            if name in known:
+                values[name] = value
+            elif any(k.startswith(f"{name}.") or name.startswith(f"{k}.") for k in known):
+                raise InputError(f"{path}: '{name}' is {_wrong_level(name, known)}")
+            else:
+                unknown.append(name)
+    return values, [*lines, *misspelt(unknown)]
+
+
+def _loaded(path: Path) -> dict[Any, Any]:
+    """The content of a parameter file. InputError where it cannot be read."""
+    if not path.exists():
+        raise InputError(f"cannot read the parameter file {path}: there is no such file"
+                         + valid_names(str(path), CONFIGURATIONS))
+    try:
+        content = yaml.safe_load(read_text(path, MAX_BYTES))
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+        raise InputError(f"cannot read the parameter file {path}: {short(error)}") from None
+    if not isinstance(content, dict | None):
+        raise InputError(f"{path} is no parameter file; see config/ for the form")
+    return content or {}
+
+
+def _applies(section: str, nodes: Collection[str]) -> bool:
+    """Return True for a section for one of these nodes, or for all nodes."""
+    return section.rpartition("/")[2] in ("*", "**", *nodes)
+
+
+def _wrong_level(name: str, known: Iterable[str]) -> str:
+    inner = [k for k in known if k.startswith(f"{name}.")]
+    return (f"a group, not a value; it holds {', '.join(inner)}" if inner else
+            "below a parameter that holds no others")
+
+
+def _dotted(path: Path, section: dict, visited: Iterator[int], prefix: str = "",
+            depth: int = 0) -> Iterator[tuple[Any, Any]]:
+    """(dotted name, value); the name as it is where it is no text. visited counts all that is
+    looked at, as groups may be empty, and may be in each other by their anchors."""
+    for key, value in section.items():
+        if next(visited) >= MAX_NAMES or depth >= MAX_DEPTH:
+            raise InputError(f"{path} has more than {MAX_NAMES} parameters, or groups in more than "
+                             f"{MAX_DEPTH} others")
+        if not isinstance(key, str):
+            yield key, value
+        elif isinstance(value, dict):
+            yield from _dotted(path, value, visited, f"{prefix}{key}.", depth + 1)
+        else:
+            yield f"{prefix}{key}", value
