@@ -170,5 +170,6 @@ def print_summary(summary: Summary, run: Run) -> None:
         more = f" ({len(others)} more such frames)" if others else ""
         console.print(Text("note", "yellow") + f": {remark}{more}")
     for problem, count in content["problems"].items():
-        console.print(Text("problem", "yellow") + f" in {count} frames: {problem}")
+        frames = "frame" if count == 1 else "frames"
+        console.print(Text("problem", "yellow") + f" in {count} {frames}: {problem}")
     print_skipped(content["skipped"], console)

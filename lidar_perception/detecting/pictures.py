@@ -55,7 +55,8 @@ class FrameDrawer:
         """Name the recording, the frame and the detector."""
         frame = result.frame
         name = f"#{frame.index}" if frame.name.startswith(str(frame.stamp_ns)) else frame.name
-        return f"{self.run.recording.path.name}  {name}  {self.run.header['detector']}"
+        path = self.run.recording.path
+        return "  ".join([*[path.name] * (path.stem != name), name, self.run.header["detector"]])
 
     def time(self, stamp_ns: int) -> str:
         """Write a stamp as a date, or without one as seconds since the first frame."""

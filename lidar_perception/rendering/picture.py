@@ -28,6 +28,7 @@ FRONT, FLOOR = [0, 3, 7, 4], [0, 1, 2, 3]  # corners of the face that looks ahea
 OTHER_FACES = [[1, 2, 6, 5], [0, 1, 5, 4], [2, 3, 7, 6], [4, 5, 6, 7]]
 RING_POINTS = 180
 MIN_RANGE, MAX_RANGE_AHEAD, MAX_RANGE_AROUND = 6.0, 55.0, 45.0  # metres that a picture shows
+POINT_SHARE = 5e-4  # of what a picture shows, the radius of a point
 FOV = 60.0         # degrees, from left to right
 FAR_SHARE = 98     # percent of the points that are in the picture
 BEV_SHARE = 0.375  # of the width, for the view from above
@@ -84,10 +85,11 @@ class Stage:
         left = self.width - right
         if self.ahead:
             behind = Perspective((-0.2 * r, -0.045 * r, 0.12 * r),
-                                 (0.24 * r, 0.01 * r, self.ground), FOV, left, self.height)
+                                 (0.24 * r, 0.01 * r, self.ground), FOV, left, self.height,
+                                 POINT_SHARE * r)
             return behind, BirdsEye((0.44 * r, 0.0), self.height / (1.14 * r), right, self.height)
         behind = Perspective((-0.5 * r, -0.1 * r, 0.4 * r), (0.02 * r, 0.0, self.ground),
-                             FOV, left, self.height)
+                             FOV, left, self.height, POINT_SHARE * r)
         return behind, BirdsEye((0.0, 0.0), self.height / (2.1 * r), right, self.height)
 
     @property
