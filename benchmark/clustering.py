@@ -14,7 +14,7 @@ from benchmark.memory import METHOD, dbscan_memory
 from benchmark.rows import against, measured, row, with_target
 from benchmark.timing import SLOW_REPEAT, Clock, evenly_chosen, in_child, thin
 from lidar_perception.clustering.dbscan import distance_aware_dbscan
-from lidar_perception.clustering.euclidean import euclidean
+from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import DbscanParams, EuclideanParams
 from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.runs.terminal import track
@@ -87,7 +87,7 @@ def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> 
 
     def calls(xyz):
         return {PLAIN: partial(plain_euclidean.euclidean, xyz, params),
-                "ours": partial(euclidean, xyz, params)}
+                "ours": partial(cluster_euclidean, xyz, params)}
 
     title = f"Adaptive Euclidean, {threshold} threshold, whole scan"
     clock, same = Clock(repeat, calls(thin(clouds[0]))), 0
@@ -102,7 +102,7 @@ def measure_paper_c(scans: list[np.ndarray], repeat: int) -> dict:
     """Paper C's segmentation of whole scans, ground included: cloth, then Euclidean."""
     def segment(xyz, threshold):
         rest = xyz.compress(~segment_by_cloth(xyz), axis=0)
-        return euclidean(rest, EuclideanParams(threshold=threshold))
+        return cluster_euclidean(rest, EuclideanParams(threshold=threshold))
 
     def calls(xyz):
         return {"cloth": partial(segment_by_cloth, xyz),

@@ -9,7 +9,7 @@ import numpy as np
 from lidar_perception.candidates.params import SeedParams
 from lidar_perception.candidates.seeds import clicked_cluster
 from lidar_perception.classes import DETECTED, Size
-from lidar_perception.clustering.shapes import oriented_boxes
+from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.geometry import points_in_box, to_box_frame, wrap_angle
 from lidar_perception.ground.surface import surface_under
 from lidar_perception.types import InputError
@@ -119,7 +119,7 @@ def completed(box: Array, usual: Size | None) -> Array:
 def _around(scan: Scan, members: Array) -> Array:
     """(7,) the L-shape around points (N,) bool, down to the ground."""
     xyz = scan.xyz[members]
-    box = oriented_boxes(xyz, np.ones(len(xyz), np.int32), "l_shape")[0].astype(np.float64)
+    box = fit_boxes(xyz, np.ones(len(xyz), np.int32), "l_shape")[0].astype(np.float64)
     floor = _floor(scan, box)
     if np.isfinite(floor):
         top = max(box[2] + box[5] / 2, floor + 0.1)

@@ -16,7 +16,7 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.candidates.silhouette import ROWS, silhouettes
-from lidar_perception.clustering.shapes import oriented_boxes
+from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import DetectorChoice
@@ -78,7 +78,7 @@ def _things(found: Segmented, counts: Array) -> Array:
     numbers = np.zeros(len(found.boxes) + 1, np.int32)
     numbers[chosen + 1] = np.arange(1, len(chosen) + 1)
     labels = numbers[found.cluster_ids]
-    shapes = oriented_boxes(found.xyz[labels > 0], labels[labels > 0], "l_shape")
+    shapes = fit_boxes(found.xyz[labels > 0], labels[labels > 0], "l_shape")
     shapes[:, [2, 5]] = found.boxes[chosen][:, [2, 5]]  # down to the ground
     return shapes
 

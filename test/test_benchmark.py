@@ -19,7 +19,7 @@ from benchmark.plain_pointnet2 import ball, farthest
 from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import print_ground, print_measured, row, target_text, value_text
 from benchmark.timing import Clock, in_child, interleaved
-from lidar_perception.clustering.euclidean import euclidean
+from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import EuclideanParams
 from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.detectors.pointpillars import detector as pointpillars
@@ -71,7 +71,7 @@ def test_the_peers_of_dbscan_give_our_clusters(place):
 @pytest.mark.parametrize("threshold", ["local", "global"])
 def test_the_plain_euclidean_gives_our_clusters(threshold):
     params = EuclideanParams(threshold=threshold)
-    ours = euclidean(cloud(), params)
+    ours = cluster_euclidean(cloud(), params)
     assert ours.max() > 0
     np.testing.assert_array_equal(plain_euclidean.euclidean(cloud(), params), ours)
 

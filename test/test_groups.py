@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import each_make, header
 
-from lidar_perception.clustering.shapes import ellipses, oriented_boxes
+from lidar_perception.clustering.shapes import fit_boxes, fit_ellipses
 from lidar_perception.groups import cluster_count, group_points, groups_of, renumbered
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import cluster_column
@@ -89,10 +89,10 @@ def test_the_column_of_a_cloud_is_read_at_the_places_asked_for(make):
 
 
 @pytest.mark.parametrize("size_by_id", [
-    cluster_count, lambda ids: oriented_boxes(np.zeros((len(ids), 3), np.float32), ids, "min_area"),
-    lambda ids: ellipses(np.zeros((len(ids), 3), np.float32), ids),
+    cluster_count, lambda ids: fit_boxes(np.zeros((len(ids), 3), np.float32), ids, "min_area"),
+    lambda ids: fit_ellipses(np.zeros((len(ids), 3), np.float32), ids),
     lambda ids: group_points(np.zeros((len(ids), 3)), ids, np.array([1]))],
-    ids=["cluster_count", "oriented_boxes", "ellipses", "group_points"])
+    ids=["cluster_count", "fit_boxes", "fit_ellipses", "group_points"])
 def test_where_rows_are_counted_by_the_largest_id_it_takes_no_memory(size_by_id):
     size_by_id(np.array([0, 1, 2, 3, 3], np.int32))
     tracemalloc.start()

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.boxes import snap_to_ground
-from lidar_perception.clustering.shapes import oriented_boxes
+from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.params import ViewParams
@@ -36,7 +36,7 @@ def grounded_boxes(xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray,
                    shape: str) -> np.ndarray:
     """(K, 7) boxes of clusters 1..K, of a shape of params.BOX_SHAPES, down to the plane through
     the ground points."""
-    return snap_to_ground(oriented_boxes(xyz, cluster_ids, shape),
+    return snap_to_ground(fit_boxes(xyz, cluster_ids, shape),
                           fit_plane(xyz.compress(ground, axis=0)))
 
 

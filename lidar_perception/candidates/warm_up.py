@@ -9,7 +9,7 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import automatic_seed
 from lidar_perception.candidates.seeds import seed_from_points
-from lidar_perception.clustering.euclidean import euclidean
+from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import EuclideanParams
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.compiling import compilation_reported
@@ -38,4 +38,4 @@ def warm_up() -> None:
             "seed.min_confidence": 0.0})
         find_candidates(LidarFrame(xyz), automatic_seed(seed, params), forward, params)
     for threshold in ("local", "global"):  # what only crowded clouds need
-        euclidean(person.astype(np.float32), EuclideanParams(threshold=threshold), -1, 0)
+        cluster_euclidean(person.astype(np.float32), EuclideanParams(threshold=threshold), -1, 0)

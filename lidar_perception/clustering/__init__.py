@@ -1,1 +1,1 @@
-"""Points to cluster ids: (N, 3) -> (N,) int32, 0 = none, 1..K."""
+"""Clustering of points: (N, 3) -> (N,) int32 ids, 0 for no cluster, 1..K for the clusters."""

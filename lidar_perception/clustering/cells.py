@@ -1,4 +1,7 @@
-"""Points sorted into cells as wide as a reach, each with the ranges of points around it."""
+"""Points sorted into cubic cells as wide as a search radius ("reach").
+
+Each cell knows the ranges of cells that hold all its points' neighbours.
+"""
 
 from __future__ import annotations
 
@@ -7,60 +10,64 @@ from collections import namedtuple
 import numpy as np
 from numba import njit
 
-from lidar_perception.clustering.grid import grid, in_order
+from lidar_perception.clustering.grid import build_grid, take_columns
 
-BLOCK = 32  # distances at a time: few enough to stop early, many enough for vector loops
+BLOCK = 32  # distances per block: few enough to stop early, many enough for vectorised loops
 
-# Points sorted into cells: their rows order (N,), float64 xyz (3, N), and start (C+1,) the first
-# of each cell. All within `reach` of cell a are in the cells low[a, k] to high[a, k] - 1 for
-# k < ranges[a], first those of its own column; these hold size[a] points.
+# N points sorted into C cells. order (N,) are their rows in the input, xyz (3, N) their float64
+# coordinates, start (C + 1,) the index of the first point of each cell. All neighbours within
+# `reach` of cell a are in the cells low[a, k] .. high[a, k] - 1 for k < ranges[a]; k = 0 is the
+# cell's own column. size[a] is the number of points in these cells.
 Cells = namedtuple("Cells", "reach order xyz start ranges size low high")
 
 
-def cells_of(xyz: np.ndarray, reach: float) -> Cells:
-    """Sort (N, 3) float32 points into cells, at least one."""
-    # A hair over reach, so that rounding never puts two neighbours more than a cell apart; at
-    # least a micrometre, as thresholds may be 0.
-    order, *rest = grid(xyz, max(reach, 1e-6) * (1.0 + 1e-6), 1)
-    return Cells(reach, order, in_order(xyz, order), rest[0], *_ranges(*rest))
+def sort_into_cells(xyz: np.ndarray, reach: float) -> Cells:
+    """Sort points (N, 3) float32, N > 0, into cells of width `reach` in metres."""
+    # Slightly more than reach, so that rounding never puts two neighbours more than one cell
+    # apart; at least a micrometre, because thresholds may be 0.
+    order, *rest = build_grid(xyz, max(reach, 1e-6) * (1.0 + 1e-6), 1)
+    return Cells(reach, order, take_columns(xyz, order), rest[0], *_find_ranges(*rest))
 
 
-def around(cells: Cells) -> float:
-    """How many points lie in the cells around a point, in the mean."""
+def mean_neighbourhood_size(cells: Cells) -> float:
+    """Return the mean number of points in the cells around a point."""
     return float(np.diff(cells.start) @ cells.size) / len(cells.order)
 
 
-# Of each cell the points that stand for all of it: xyz (3, S) float64, start (C + 1,) and weight
-# (C,), how many each stands for.
+# S points that represent the points of C cells: xyz (3, S) float64, start (C + 1,) the first of
+# each cell, and weight (C,) the number of points that each of them represents.
 Sample = namedtuple("Sample", "xyz start weight")
 
 
-def sample_of(cells: Cells, work: int) -> Sample:
-    """So many points of each cell, at least one, that all around all points are at most `work`, as
-    far as halves go. Chosen by their coordinates, as by chance: the order of the points, and what
-    else there is in the cloud, makes no difference."""
+def sample_cells(cells: Cells, work: int) -> Sample:
+    """Choose at least one point per cell to represent it.
+
+    The limit per cell is halved until the distances from all points to the sample of their
+    neighbourhoods number at most `work`. Points are chosen by a hash of their coordinates, so the
+    result does not depend on the order of the points or on the rest of the cloud.
+    """
     sizes = np.diff(cells.start)
-    most = int(sizes.max())
-    while most > 1 and _work(cells, np.minimum(sizes, most)) > work:
-        most //= 2
-    kept = np.minimum(sizes, most)
+    limit = int(sizes.max())
+    while limit > 1 and _count_distances(cells, np.minimum(sizes, limit)) > work:
+        limit //= 2
+    kept = np.minimum(sizes, limit)
     start = np.concatenate([[0], np.cumsum(kept)])
     bits = cells.xyz.astype(np.float32).view(np.uint32).astype(np.uint64)
-    return Sample(_chosen(cells, _mixed(bits), start), start, sizes / kept)
+    return Sample(_take_sample(cells, _mix_bits(bits), start), start, sizes / kept)
 
 
-def _mixed(bits: np.ndarray) -> np.ndarray:
-    """(N,) uint64 from (3, N): nearly a random number for each of different columns (splitmix)."""
+def _mix_bits(bits: np.ndarray) -> np.ndarray:
+    """Hash each column of (3, N) uint64 to one uint64 (splitmix64)."""
     mixed = bits[0] << np.uint64(32) | bits[1]
-    for more in (bits[2], np.uint64(0)):
+    for increment in (bits[2], np.uint64(0)):
         mixed = (mixed ^ mixed >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
-        mixed = (mixed ^ mixed >> np.uint64(27)) * np.uint64(0x94D049BB133111EB) + more
+        mixed = (mixed ^ mixed >> np.uint64(27)) * np.uint64(0x94D049BB133111EB) + increment
     return mixed ^ mixed >> np.uint64(31)
 
 
 @njit(cache=True, nogil=True)
-def _work(cells, kept):
-    """Distances from all points to the kept ones (C,) of the cells around them."""
+def _count_distances(cells, kept):
+    """Count the distances from all points to the kept points (C,) of the cells around them."""
     before, total = np.zeros(len(kept) + 1), 0.0
     for a in range(len(kept)):
         before[a + 1] = before[a] + kept[a]
@@ -72,20 +79,20 @@ def _work(cells, kept):
 
 
 @njit(cache=True, nogil=True)
-def _chosen(cells, keys, start):
+def _take_sample(cells, keys, start):
     out = np.empty((3, start[-1]))
     for a in range(len(start) - 1):
         first = cells.start[a]
         rows = np.argsort(keys[first:cells.start[a + 1]], kind="mergesort")
         kept = start[a + 1] - start[a]
-        for k in range(kept):  # each so many-th: of places where many coincide as many as elsewhere
+        for k in range(kept):  # evenly spaced, so that coincident points are not over-represented
             out[:, start[a] + k] = cells.xyz[:, first + rows[k * len(rows) // kept]]
     return out
 
 
 @njit(cache=True, nogil=True)
 def gather_sample(cells, sample, a):
-    """near (3, M) and weight (M,): the sample of the cells around cell a."""
+    """Return the sample of the cells around cell a: xyz (3, M) and weight (M,)."""
     size = 0
     for k in range(cells.ranges[a]):
         size += sample.start[cells.high[a, k]] - sample.start[cells.low[a, k]]
@@ -99,7 +106,7 @@ def gather_sample(cells, sample, a):
 
 
 @njit(cache=True, nogil=True)
-def _ranges(start, cell_z, column_start, neighbours):
+def _find_ranges(start, cell_z, column_start, neighbours):
     columns, half = neighbours.shape
     low = np.empty((len(cell_z), 2 * half - 1), np.int32)
     high, ranges, size = np.empty_like(low), np.zeros_like(cell_z), np.zeros_like(cell_z)
@@ -116,7 +123,7 @@ def _ranges(start, cell_z, column_start, neighbours):
 
 @njit(cache=True, nogil=True)
 def _add_ranges(start, cell_z, column_start, own, other, low, high, ranges, size):
-    """The cells of column `other` that are at most one higher or lower than each of column own."""
+    """Add, for each cell of column `own`, the cells of column `other` at most one level apart."""
     begin = end = column_start[other]
     last = column_start[other + 1]
     for a in range(column_start[own], column_start[own + 1]):
@@ -132,9 +139,12 @@ def _add_ranges(start, cell_z, column_start, own, other, low, high, ranges, size
 
 
 @njit(cache=True, nogil=True)
-def gather(cells, a, out):
-    """Copy the points around cell a side by side, for long loops. Here and below unsigned indices
-    tell the compiler that none counts from the end: only then does it make vector loops."""
+def gather_neighbourhood(cells, a, out):
+    """Copy the points around cell a into out (3, M), contiguously.
+
+    Here and below, unsigned indices tell the compiler that no index is negative; it vectorises
+    the loops only then.
+    """
     put = np.uint64(0)
     for k in range(cells.ranges[a]):
         for j in range(np.uint64(cells.start[cells.low[a, k]]),
@@ -145,25 +155,32 @@ def gather(cells, a, out):
 
 
 @njit(cache=True, nogil=True)
-def crowded(cells, reach2, enough, work):
-    """(N,) bool, cell by cell: at least `enough` points lie within reach, itself included. reach2
-    (N,): the square of each point's own, at most that of the cells. And how much is left of the
-    work, a number of distances; once it is below 0, the rest is not looked at."""
-    leads, near = np.zeros(len(reach2), np.bool_), np.empty((3, cells.size.max()))
+def find_core_points(cells, reach2, min_points, work):
+    """Find the points with at least min_points points within reach, themselves included.
+
+    Args:
+        reach2: (N,) squared reach of each point, in the order of the cells; at most the cells'.
+        min_points: float; need not be whole.
+        work: the number of distances that may be computed. The search stops when it is used up.
+
+    Returns:
+        (N,) bool in the order of the cells, and the work that is left, negative if it stopped.
+    """
+    is_core, near = np.zeros(len(reach2), np.bool_), np.empty((3, cells.size.max()))
     for a in range(len(cells.size)):
         if work < 0:
             break
         work -= cells.size[a]
-        gather(cells, a, near)
+        gather_neighbourhood(cells, a, near)
         for i in range(cells.start[a], cells.start[a + 1]):
             px, py, pz = cells.xyz[0, i], cells.xyz[1, i], cells.xyz[2, i]
             found, begin, size = 0, 0, cells.size[a]
-            while found < enough and begin < size:
+            while found < min_points and begin < size:
                 for j in range(np.uint64(begin), np.uint64(min(begin + BLOCK, size))):
                     dx, dy, dz = px - near[0, j], py - near[1, j], pz - near[2, j]
                     one = 1 if dx * dx + dy * dy + dz * dz <= reach2[i] else 0
                     found += one
                 begin += BLOCK
             work -= begin
-            leads[i] = found >= enough
-    return leads, work
+            is_core[i] = found >= min_points
+    return is_core, work

@@ -1,4 +1,4 @@
-"""Points to clusters, by either of the two methods."""
+"""Clustering of a cloud by the method that the parameters name."""
 
 from __future__ import annotations
 
@@ -6,47 +6,69 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidar_perception.clustering.dbscan import distance_aware_dbscan
-from lidar_perception.clustering.density import density, followed, radii
-from lidar_perception.clustering.euclidean import euclidean
+from lidar_perception.clustering.density import adapt_to_density, compute_radii, measure_density
+from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.types import LidarFrame, as_frame, check_columns, usable_returns
 
 
 def cluster(cloud: LidarFrame | ArrayLike, params: ClusteringParams = ClusteringParams(),
-            seen: float = 0.0) -> np.ndarray:
-    """Return (N,) int32 cluster ids of the N points of a LidarFrame or of an array (N, 3) or (N, 4)
-    as LidarFrame.of takes it: 0 = none, 1..K. Points that are not finite, and the origin, have 0;
-    no points give (0,). seen: points a square degree of view, which params.density compares with;
-    0: params hold as they are. InputError for other arrays."""
+            density: float = 0.0) -> np.ndarray:
+    """Cluster the points of a cloud.
+
+    Args:
+        cloud: a LidarFrame, or an array (N, 3) or (N, 4) as LidarFrame.of takes it.
+        density: points per square degree of view, which is compared with params.density; 0 applies
+            the parameters unchanged.
+
+    Returns:
+        (N,) int32 ids, 0 for no cluster, 1..K for the clusters. Points that are not finite and
+        points at the origin have 0. An empty cloud gives (0,).
+
+    Raises:
+        InputError: for an array of another shape or type.
+    """
     xyz = as_frame(cloud).xyz
     usable = usable_returns(xyz)
     if usable.all():
-        return _clustered(xyz, params, seen)
+        return _cluster_usable(xyz, params, density)
     labels = np.zeros(len(xyz), np.int32)
-    labels[usable] = _clustered(xyz[usable], params, seen)
+    labels[usable] = _cluster_usable(xyz[usable], params, density)
     return labels
 
 
-def _clustered(xyz: np.ndarray, given: ClusteringParams, seen: float) -> np.ndarray:
-    params = followed(given, seen)
+def _cluster_usable(xyz: np.ndarray, given: ClusteringParams, density: float) -> np.ndarray:
+    params = adapt_to_density(given, density)
     if params.method == "dbscan":
         return distance_aware_dbscan(xyz, params.dbscan)
-    reach = None if params is given else radii(xyz, seen, given.euclidean.radius,
-                                               params.euclidean.radius)
-    return euclidean(xyz, params.euclidean, radii=reach)
+    radii = None if params is given else compute_radii(xyz, density, given.euclidean.radius,
+                                                       params.euclidean.radius)
+    return cluster_euclidean(xyz, params.euclidean, radii=radii)
 
 
 def cluster_obstacles(cloud: LidarFrame | ArrayLike, ground: np.ndarray,
                       params: ClusteringParams = ClusteringParams(),
-                      sensed: np.ndarray | None = None) -> np.ndarray:
-    """Return (M,) int32 cluster ids of the M points of a cloud, see cluster(), that are not ground
-    (M,) bool; ground has 0. Where params are made for some density, that of all points is measured,
-    or of sensed (N, 3), the cloud as the sensor sees it, where its points have been moved to
-    another height. InputError for a ground of another length."""
+                      sensor_xyz: np.ndarray | None = None) -> np.ndarray:
+    """Cluster the points of a cloud that are not ground.
+
+    Args:
+        cloud: M points, as cluster() takes them.
+        ground: (M,) bool.
+        sensor_xyz: (N, 3) points relative to the sensor, from which the density is measured if
+            params.density is set; by default the cloud itself. Needed where the cloud has been
+            moved to another height.
+
+    Returns:
+        (M,) int32 ids as of cluster(); ground points have 0.
+
+    Raises:
+        InputError: for a ground of another length.
+    """
     xyz, ground = as_frame(cloud).xyz, np.asarray(ground, bool)
     check_columns(len(xyz), ground=ground)
     labels = np.zeros(len(xyz), np.int32)
     obstacles = np.flatnonzero(~ground)
-    seen = density(xyz if sensed is None else sensed) if params.density else 0.0
-    labels[obstacles] = cluster(xyz.take(obstacles, axis=0), params, seen)
+    density = (measure_density(xyz if sensor_xyz is None else sensor_xyz) if params.density
+               else 0.0)
+    labels[obstacles] = cluster(xyz.take(obstacles, axis=0), params, density)
     return labels

@@ -1,4 +1,4 @@
-"""How densely a cloud samples what it sees, and clustering whose numbers follow it."""
+"""Angular density of a cloud, and clustering parameters that adapt to it."""
 
 from __future__ import annotations
 
@@ -10,66 +10,78 @@ from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.geometry import horizontal_range
 from lidar_perception.types import usable_returns
 
-CELL = 2.0       # degrees: the gap between the beams of a VLP-16
-LOOKED_AT = 30_000  # points, of a larger cloud
-WIDEST = 4.0     # times as wide are neighbourhoods at most
-FEWEST = 3       # points of a cluster, at least, and one less within eps
-# So many distances between points on a surface that faces the sensor are within a widened radius of
-# the local threshold, and within a widened eps at the end of its band.
-IN_RADIUS, IN_EPS = 4.0, 2.5
-BEYOND = 1.5     # times as far as the last limit is the end of the last band
+CELL_DEG = 2.0          # the gap between the beams of a VLP-16
+MAX_SAMPLED = 30_000    # points of a larger cloud that are sampled
+MAX_WIDENING = 4.0      # largest factor by which neighbourhoods widen
+MIN_CLUSTER_POINTS = 3  # lower limit of min_size; that of min_samples is one less
+# A widened radius of the local threshold, and a widened eps at the end of its band, in multiples of
+# the distance between neighbouring points on a surface that faces the sensor.
+SPACINGS_PER_RADIUS, SPACINGS_PER_EPS = 4.0, 2.5
+LAST_BAND_FACTOR = 1.5  # assumed end of the last band, as a multiple of the last range limit
 
 
-def density(xyz: np.ndarray) -> float:
-    """Points a square degree of view: how many others lie in the direction of a usable return of
-    (N, 3) float32, metres from the sensor, in the mean. 0 where none has another beside it; N may
-    be 0. KITTI's HDL-64E has 13 to 16, however its clouds are cropped."""
-    step = max(len(xyz) // LOOKED_AT, 1)
-    looked_at = xyz[::step]
-    x, y, z = looked_at.compress(usable_returns(looked_at), axis=0).T
-    away = np.hypot(x, y)
-    row = (np.degrees(np.arctan2(z, away)) + 90.0) // CELL
-    column = (np.degrees(np.arctan2(y, x)) + 180.0) // CELL
-    cell = (row * (360.0 // CELL + 1.0) + column).astype(np.int64)
+def measure_density(xyz: np.ndarray) -> float:
+    """Return the mean number of points per square degree around a point, seen from the sensor.
+
+    xyz: (N, 3) float32, metres from the sensor; N may be 0. The result is 0 if no usable point has
+    another in its cell of the view. KITTI's HDL-64E has 13 to 16, also in cropped clouds.
+    """
+    step = max(len(xyz) // MAX_SAMPLED, 1)
+    sampled = xyz[::step]
+    x, y, z = sampled.compress(usable_returns(sampled), axis=0).T
+    distance = np.hypot(x, y)
+    row = (np.degrees(np.arctan2(z, distance)) + 90.0) // CELL_DEG
+    column = (np.degrees(np.arctan2(y, x)) + 180.0) // CELL_DEG
+    cell = (row * (360.0 // CELL_DEG + 1.0) + column).astype(np.int64)
     others = np.bincount(cell).take(cell) - 1.0 if len(cell) else np.zeros(0)
-    slant = np.maximum(away / np.hypot(away, z), 0.05)  # a cell is the narrower the steeper it lies
-    return step * float((others / (CELL**2 * slant)).mean()) if len(cell) else 0.0
+    # Cells narrow towards the zenith and the nadir.
+    slant = np.maximum(distance / np.hypot(distance, z), 0.05)
+    return step * float((others / (CELL_DEG**2 * slant)).mean()) if len(cell) else 0.0
 
 
-def followed(params: ClusteringParams, seen: float) -> ClusteringParams:
-    """params for a cloud of `seen` points a square degree: in one that is thinner than they are
-    made for neighbourhoods widen, at most as its points move apart, and least sizes shrink with
-    their number. The same object where the cloud is not thinner, where they are made for every
-    cloud, and where `seen` is 0."""
-    if not 0.0 < seen < params.density:
+def adapt_to_density(params: ClusteringParams, density: float) -> ClusteringParams:
+    """Return the parameters for a cloud with this many points per square degree.
+
+    In a cloud sparser than params.density, neighbourhoods widen, at most in proportion to the
+    distance between points, and minimum sizes shrink in proportion to the number of points.
+    params itself is returned if the cloud is not sparser or either density is 0.
+    """
+    if not 0.0 < density < params.density:
         return params
-    wider = min((params.density / seen) ** 0.5, WIDEST)
+    widening = min((params.density / density) ** 0.5, MAX_WIDENING)
     dbscan, euclidean = params.dbscan, params.euclidean
-    ends = [*dbscan.range_limits, BEYOND * dbscan.range_limits[-1] if dbscan.range_limits else 1e6]
+    limits = dbscan.range_limits
+    ends = [*limits, LAST_BAND_FACTOR * limits[-1] if limits else 1e6]
     return replace(
         params,
         dbscan=replace(
-            dbscan, eps=tuple(min(max(eps, IN_EPS * spacing(seen) * end), wider * eps)
-                              for eps, end in zip(dbscan.eps, ends)),
-            min_samples=_fewer(dbscan.min_samples, wider**2, FEWEST - 1)),
+            dbscan,
+            eps=tuple(min(max(eps, SPACINGS_PER_EPS * point_spacing(density) * end), widening * eps)
+                      for eps, end in zip(dbscan.eps, ends)),
+            min_samples=_reduce_count(dbscan.min_samples, widening**2, MIN_CLUSTER_POINTS - 1)),
         euclidean=replace(
-            euclidean, radius=min(euclidean.radius * wider, 10.0),
-            distance=min(euclidean.distance * wider, 10.0), beta=euclidean.beta / wider,
-            min_size=_fewer(euclidean.min_size, wider**2, FEWEST)))
+            euclidean, radius=min(euclidean.radius * widening, 10.0),
+            distance=min(euclidean.distance * widening, 10.0), beta=euclidean.beta / widening,
+            min_size=_reduce_count(euclidean.min_size, widening**2, MIN_CLUSTER_POINTS)))
 
 
-def spacing(seen: float) -> float:
-    """Metres between neighbours on a surface that faces the sensor 1 m away, where `seen` points,
-    more than 0, lie in a square degree."""
-    return float(np.radians(seen**-0.5))
+def point_spacing(density: float) -> float:
+    """Return the distance between neighbouring points on a surface 1 m from the sensor, in metres.
+
+    The surface faces the sensor; density, in points per square degree, is above 0.
+    """
+    return float(np.radians(density**-0.5))
 
 
-def _fewer(count: int, thinner: float, least: int) -> int:
-    return min(count, max(round(count / thinner), least))
+def _reduce_count(count: int, factor: float, minimum: int) -> int:
+    return min(count, max(round(count / factor), minimum))
 
 
-def radii(xyz: np.ndarray, seen: float, least: float, most: float) -> np.ndarray:
-    """(N,) float64 m: the radius of the local threshold that the horizontal range of each of points
-    (N, 3) asks for in a cloud of `seen` points a square degree, between least and most."""
-    return np.clip(IN_RADIUS * spacing(seen) * horizontal_range(xyz).astype(np.float64), least,
-                   most)
+def compute_radii(xyz: np.ndarray, density: float, low: float, high: float) -> np.ndarray:
+    """Return (N,) float64 the local threshold's radius for each of points (N, 3), in metres.
+
+    It grows with the point's horizontal range and shrinks with the cloud's density, in points per
+    square degree, between low and high.
+    """
+    ranges = horizontal_range(xyz).astype(np.float64)
+    return np.clip(SPACINGS_PER_RADIUS * point_spacing(density) * ranges, low, high)

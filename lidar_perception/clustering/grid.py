@@ -1,4 +1,4 @@
-"""Points sorted into a grid of columns of cells: the neighbourhoods of DBSCAN."""
+"""Points sorted into a grid of columns of cells, and a union-find forest to join them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,18 @@ def _hash(ix, iy, mask):
 
 
 @njit(cache=True, nogil=True)
-def grid(xyz, side, reach):
-    """Sort points by cell: columns of cells with the same x and y, in each column ascending z.
+def build_grid(xyz, side, reach):
+    """Sort points (N, 3) by cell: columns of cells with equal x and y, in ascending z.
 
-    Returns order (N,), cell_start (C+1,), cell_z (C,), column_start (M+1,) first cell of each
-    column, and neighbours (M, H): the column itself and half of those up to `reach` columns away,
-    -1 if empty; the other half see this column as theirs.
+    Args:
+        side: width of a cell in metres.
+        reach: distance of neighbouring columns, in cells.
+
+    Returns:
+        order (N,), the rows of the points; cell_start (C + 1,), the first point of each cell;
+        cell_z (C,), the level of each cell; column_start (M + 1,), the first cell of each column;
+        neighbours (M, H), the column itself and half of the columns up to `reach` away, -1 if
+        empty. The other half list this column as their neighbour.
     """
     n = len(xyz)
     size = 16
@@ -49,7 +55,7 @@ def grid(xyz, side, reach):
                 break
             slot = (slot + 1) & mask
         column[i] = c
-    order = stable_order(column, columns, _order_by_height(z))[0]
+    order = stable_order(column, columns, _sort_by_height(z))[0]
 
     cell_start, cell_z = np.empty(n + 1, np.int64), np.empty(n, np.int64)
     column_start = np.empty(columns + 1, np.int64)
@@ -85,16 +91,16 @@ def grid(xyz, side, reach):
 
 
 @njit(cache=True, nogil=True)
-def _order_by_height(z):
+def _sort_by_height(z):
     low, high = z.min(), z.max()
-    if high - low > 8 * len(z) + 4096:  # far outliers: too many levels to count
+    if high - low > 8 * len(z) + 4096:  # far outliers make too many levels for a counting sort
         return np.argsort(z, kind="mergesort")
     return stable_order((z - low).astype(np.int32), high - low + 1, np.arange(len(z)))[0]
 
 
 @njit(cache=True, nogil=True)
-def in_order(xyz, order):
-    """(3, N) float64: the coordinates of the points (N, 3) in that order."""
+def take_columns(xyz, order):
+    """Return (3, N) float64: the coordinates of points (N, 3) in the given order."""
     out = np.empty((3, len(order)))
     for k in range(len(order)):
         i = order[k]
@@ -103,15 +109,15 @@ def in_order(xyz, order):
 
 
 @njit(cache=True, nogil=True)
-def near(x, y, z, i, j, eps2):
-    """True if points i and j are within eps; float64, as scikit-learn computes it."""
+def is_near(x, y, z, i, j, eps2):
+    """Return True if points i and j are within eps, in float64 as scikit-learn computes it."""
     dx, dy, dz = x[i] - x[j], y[i] - y[j], z[i] - z[j]
     return dx * dx + dy * dy + dz * dz <= eps2
 
 
 @njit(cache=True, nogil=True)
-def root(parent, i):
-    """The representative of i in a union-find forest (path halving)."""
+def find_root(parent, i):
+    """Return the representative of i in a union-find forest (path halving)."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]
@@ -119,8 +125,8 @@ def root(parent, i):
 
 
 @njit(cache=True, nogil=True)
-def grown(values, count, capacity):
-    """values[:count] in a new array of that capacity."""
+def enlarge_array(values, count, capacity):
+    """Copy values[:count] into a new array of this capacity."""
     new = np.empty(capacity, values.dtype)
     new[:count] = values[:count]
     return new
@@ -128,9 +134,15 @@ def grown(values, count, capacity):
 
 @njit(cache=True, nogil=True)
 def number_clusters(order, core, owner, parent):
-    """(S,) int32 cluster of each set of the union-find forest parent (S,), 0 for sets without a
-    core point. Clusters are numbered 1..K by their first core point in the order of the input;
-    order, core and owner (N,) are the input row, the core flag and the set of each grid point."""
+    """Number the sets of a union-find forest 1..K by their first core point in input order.
+
+    Args:
+        order, core, owner: (N,) input row, core flag and set of each point in grid order.
+        parent: (S,) the forest.
+
+    Returns:
+        (S,) int32 cluster of each set, 0 for sets without a core point.
+    """
     place = np.empty(len(order), np.int32)
     for k in range(len(order)):
         place[order[k]] = k
@@ -139,10 +151,10 @@ def number_clusters(order, core, owner, parent):
     for i in range(len(order)):
         k = place[i]
         if core[k]:
-            top = root(parent, owner[k])
+            top = find_root(parent, owner[k])
             if cluster[top] == 0:
                 count += 1
                 cluster[top] = count
     for s in range(len(parent)):
-        cluster[s] = cluster[root(parent, s)]
+        cluster[s] = cluster[find_root(parent, s)]
     return cluster

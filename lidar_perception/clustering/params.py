@@ -1,4 +1,4 @@
-"""The numbers of the clustering methods, and the shape of boxes."""
+"""Parameters of the clustering methods and of the boxes of clusters."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ class EuclideanParams(Params):
 
 
 CLUSTERING_METHODS = ("dbscan", "euclidean")
-FULL_DENSITY = 10.0  # points a square degree that our numbers need; the HDL-64E has 13 to 16
+FULL_DENSITY = 10.0  # points per square degree that our values need; the HDL-64E has 13 to 16
 
 
 @dataclass(frozen=True)
 class ClusteringParams(Params):
-    """Which points that are not ground belong together."""
+    """Clustering of the points that are not ground."""
 
     method: str = param("dbscan", "dbscan: distance-aware DBSCAN (STM-CPA paper). euclidean: "
                         "adaptive Euclidean clustering (improved-PointNet paper).",

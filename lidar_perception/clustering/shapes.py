@@ -1,7 +1,7 @@
-"""What a cluster looks like from above: its box, its ellipse, and a class by its size.
+"""Boxes and ellipses of clusters, and a class by size.
 
-Clusters come as finite points (N, 3) float32 and labels (N,) int32, 0 = no cluster, 1..K; K = 0
-gives no rows. Ids are contiguous by contract; an id without points still gets a row of zeros.
+Clusters are finite points (N, 3) float32 with labels (N,) int32, 0 for no cluster, 1..K; K = 0
+gives no rows. Ids are contiguous by contract, but an id without points still gets a row of zeros.
 """
 
 from __future__ import annotations
@@ -11,15 +11,17 @@ from numba import njit
 
 from lidar_perception.classes import BY_SIZE, CLASSES, DETECTED, MAX_DIAGONAL
 from lidar_perception.clustering.params import BOX_SHAPES
-from lidar_perception.clustering.rectangles import grouped, rectangles
+from lidar_perception.clustering.rectangles import fit_rectangles, sort_by_cluster
 from lidar_perception.groups import cluster_count
 
 
 @njit(cache=True, nogil=True)
-def extents(xyz: np.ndarray, labels: np.ndarray,
+def find_extents(xyz: np.ndarray, labels: np.ndarray,
             count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """low (K, 3), high (K, 3) float32 of the points of clusters 1..K, and sizes (K,) int64.
-    A cluster without points has low = inf, high = -inf."""
+    """Return low (K, 3), high (K, 3) float32 and sizes (K,) int64 of clusters 1..K = count.
+
+    A cluster without points has low = inf, high = -inf.
+    """
     low = np.full((count, 3), np.inf, np.float32)
     high = np.full((count, 3), -np.inf, np.float32)
     sizes = np.zeros(count, np.int64)
@@ -33,39 +35,48 @@ def extents(xyz: np.ndarray, labels: np.ndarray,
     return low, high, sizes
 
 
-def oriented_boxes(xyz: np.ndarray, labels: np.ndarray, shape: str) -> np.ndarray:
-    """(K, 7) float32 boxes [x y z l w h yaw] of clusters 1..K = labels.max(), metres, radians.
+def fit_boxes(xyz: np.ndarray, labels: np.ndarray, shape: str) -> np.ndarray:
+    """Fit a box to each of the clusters 1..K = labels.max().
 
-    shape, one of BOX_SHAPES. axis_aligned: l along x, w along y, yaw 0. min_area: the rectangle
-    of least area in x-y, exactly. l_shape: the rectangle whose sides the points lie closest to,
-    to one degree. The last two have l >= w and yaw in [-pi/2, pi/2); at one place l = w = yaw = 0,
-    on a line w = 0 and yaw is along it. z and h come from the lowest and the highest point. The
-    order of the points makes no difference.
+    Args:
+        shape: one of BOX_SHAPES. axis_aligned: l along x, w along y, yaw 0. min_area: the exact
+            rectangle of least area in x-y. l_shape: the rectangle whose sides are closest to the
+            points, to one degree.
+
+    Returns:
+        (K, 7) float32 [x y z l w h yaw] in metres and radians. z and h come from the lowest and
+        the highest point. min_area and l_shape have l >= w and yaw in [-pi/2, pi/2). Points at one
+        place have l = w = yaw = 0; points on a line have w = 0 and yaw along it. The order of the
+        points does not matter.
     """
     if shape not in BOX_SHAPES:
         raise ValueError(f"shape = {shape!r} must be one of {', '.join(BOX_SHAPES)}")
     count = cluster_count(labels)
     xyz, labels = np.ascontiguousarray(xyz, np.float32), np.ascontiguousarray(labels, np.int32)
-    low, high, sizes = extents(xyz, labels, count)
+    low, high, sizes = find_extents(xyz, labels, count)
     low[sizes == 0] = high[sizes == 0] = 0
     boxes = np.zeros((count, 7), np.float32)
     boxes[:, :3] = (low + high) / 2
     boxes[:, 3:6] = high - low
     if shape != "axis_aligned" and count:
-        x, y, start = grouped(xyz, labels, sizes)
-        found = rectangles(x, y, start, shape == "l_shape")
+        x, y, start = sort_by_cluster(xyz, labels, sizes)
+        found = fit_rectangles(x, y, start, shape == "l_shape")
         boxes[:, [0, 1, 3, 4]] = found[:, :4]
-        boxes[:, 6] = _folded(found[:, 4])
+        boxes[:, 6] = _fold_direction(found[:, 4])
     return boxes
 
 
-def ellipses(xyz: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """(K, 5) float32 ellipses [x y a b yaw] in x-y of clusters 1..K = labels.max(); a >= b >= 0
-    are half axes in metres, yaw of the long one in [-pi/2, pi/2). (0, 5) without clusters.
+def fit_ellipses(xyz: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Fit an ellipse in x-y to each of the clusters 1..K = labels.max().
 
-    Our reading of paper B's "fitted ellipse" (it gives no formula): centre and axes are those of
-    the points' covariance, and a half axis is 2 standard deviations, as it is exactly for an
-    ellipse filled evenly. It covers most of a cluster; a few stray points may lie outside.
+    This is our reading of paper B's "fitted ellipse", for which it gives no formula: centre and
+    axes are those of the points' covariance, and a half axis is 2 standard deviations, which is
+    exact for an evenly filled ellipse. It covers most of a cluster; a few stray points may lie
+    outside.
+
+    Returns:
+        (K, 5) float32 [x y a b yaw]; a >= b >= 0 are half axes in metres, yaw is the direction of
+        the longer one in [-pi/2, pi/2).
     """
     members = np.flatnonzero(labels > 0)
     cluster, count = labels[members] - 1, cluster_count(labels)
@@ -80,15 +91,19 @@ def ellipses(xyz: np.ndarray, labels: np.ndarray) -> np.ndarray:
     xx, yy, xy = mean(x * x), mean(y * y), mean(x * y)
     middle, root = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     a, b = 2 * np.sqrt(middle + root), 2 * np.sqrt(np.maximum(middle - root, 0))
-    yaw = _folded(np.arctan2(2 * xy, xx - yy) / 2)
+    yaw = _fold_direction(np.arctan2(2 * xy, xx - yy) / 2)
     return np.stack([centre_x, centre_y, a, b, yaw], axis=1).astype(np.float32)
 
 
-def class_by_diagonal(boxes: np.ndarray) -> np.ndarray:
-    """(K,) int32 ids into CLASSES of boxes (K, 7) by the diagonal hypot(l, w): Pedestrian,
-    Cyclist, Car, or -1, none of them: below 0.40 m or above 6.40 m. Paper B, Table 2."""
+def classify_by_diagonal(boxes: np.ndarray) -> np.ndarray:
+    """Classify boxes (K, 7) by their diagonal hypot(l, w) (paper B, Table 2).
+
+    Returns:
+        (K,) int32 ids into CLASSES: Pedestrian, Cyclist or Car, or -1 for a diagonal below 0.40 m
+        or above 6.40 m.
+    """
     sides = np.asarray(boxes, np.float32).reshape(-1, 7)[:, 3:5]
-    diagonal = np.hypot(sides[:, 0], sides[:, 1])  # float32, so that 6.40 is not above 6.40
+    diagonal = np.hypot(sides[:, 0], sides[:, 1])  # in float32, so that 6.40 is not above 6.40
     ids = np.full(len(diagonal), -1, np.int32)
     for name in reversed(BY_SIZE):
         ids[(diagonal >= DETECTED[name].min_diagonal) & (diagonal <= MAX_DIAGONAL)] = CLASSES.index(
@@ -96,8 +111,8 @@ def class_by_diagonal(boxes: np.ndarray) -> np.ndarray:
     return ids
 
 
-def _folded(yaw: np.ndarray) -> np.ndarray:
-    """Directions of lines as float32 in [-pi/2, pi/2)."""
+def _fold_direction(yaw: np.ndarray) -> np.ndarray:
+    """Return the directions of lines as float32 in [-pi/2, pi/2)."""
     half = np.float32(np.pi / 2)
     folded = ((yaw + np.pi / 2) % np.pi - np.pi / 2).astype(np.float32)
-    return np.where(folded >= half, -half, folded)  # a hair below pi/2 rounds to it
+    return np.where(folded >= half, -half, folded)  # values just below pi/2 round up to it

@@ -10,7 +10,7 @@ import numpy as np
 from std_msgs.msg import Float64
 
 from lidar_perception.candidates.refine import Candidates
-from lidar_perception.clustering.shapes import class_by_diagonal
+from lidar_perception.clustering.shapes import classify_by_diagonal
 from lidar_perception.ground.above import obstacles
 from lidar_perception.nodes.runtime import CLOUD, MARKERS, OK, RELIABLE, WARN, LidarNode
 from lidar_perception.nodes.track_outputs import (
@@ -62,7 +62,7 @@ def _texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
     """For the text of each box's marker: its id, and what it could be by its length and width
     alone."""
     return [{"id": i, **({"size_class": CLASSES[c]} if c >= 0 else {})}
-            for i, c in zip(ids, class_by_diagonal(boxes), strict=True)]
+            for i, c in zip(ids, classify_by_diagonal(boxes), strict=True)]
 
 
 class Obstacles:

@@ -14,7 +14,7 @@ from lidar_perception.candidates.refine import STAGES, Candidates, refine
 from lidar_perception.candidates.seeds import Seed
 from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.clustering.shapes import oriented_boxes
+from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import bev_and_3d_iou
 from lidar_perception.ground.threshold import fit_plane
@@ -106,7 +106,7 @@ def _clusters(segmented: Segmented, plane: np.ndarray | None, seed: Seed, eps: f
     params = with_values(PAPER, {"clustering.dbscan.eps": (eps,) * bands,
                                     "clustering.dbscan.min_samples": min_samples})
     ids = cluster_obstacles(segmented.xyz, segmented.ground, params.clustering)
-    boxes = snap_to_ground(oriented_boxes(segmented.xyz, ids, params.boxes.shape), plane)
+    boxes = snap_to_ground(fit_boxes(segmented.xyz, ids, params.boxes.shape), plane)
     return boxes[height_matches(boxes, seed.height, params.height)]
 
 

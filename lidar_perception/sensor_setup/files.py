@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.clustering.density import followed
+from lidar_perception.clustering.density import adapt_to_density
 from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.robot.poses import moved_points
@@ -183,7 +183,7 @@ def _of_resolution(m: Measured) -> dict[str, tuple[Any, str]]:
     samples = int(np.clip(round(default["clustering.dbscan.min_samples"] * density), MIN_SAMPLES,
                           default["clustering.dbscan.min_samples"]))
     seen = 1.0 / (up * aside)
-    made = followed(ClusteringParams(density=FULL_DENSITY), seen).euclidean
+    made = adapt_to_density(ClusteringParams(density=FULL_DENSITY), seen).euclidean
     return {
         "clustering.dbscan.range_limits": (LIMITS, "a fourth band, as the resolution allows"),
         "clustering.dbscan.eps": (eps, f"{EPS_BEAMS} times the distance of the beams at the end "

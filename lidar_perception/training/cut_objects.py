@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.clustering.shapes import extents
+from lidar_perception.clustering.shapes import find_extents
 from lidar_perception.detectors.pointnet.clusters import ground_under
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.geometry import bev_iou
@@ -101,7 +101,7 @@ def things_in(scene: TrainingScene, min_points: int,
     ground = segment_ground(LidarFrame(xyz), replace(
         EXPERT_GROUND, sensor_pose=SensorPoseParams(height=scene.height)))
     ids = cluster_obstacles(xyz, ground, EXPERT_CLUSTERING)
-    low, high, sizes = extents(xyz, ids, int(ids.max(initial=0)))
+    low, high, sizes = find_extents(xyz, ids, int(ids.max(initial=0)))
     boxes = np.zeros((len(sizes), 7))
     boxes[:, :2] = (low[:, :2] + high[:, :2]) / 2
     boxes[:, 3:5] = high[:, :2] - low[:, :2]

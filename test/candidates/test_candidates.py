@@ -14,7 +14,7 @@ from lidar_perception.candidates.pipeline import find_candidates, refined, segme
 from lidar_perception.candidates.refine import refine
 from lidar_perception.candidates.seed_sources import clicked_seed, fixed_seed, truth_seed
 from lidar_perception.candidates.seeds import Seed, seed_from_points
-from lidar_perception.clustering.shapes import oriented_boxes
+from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.data.open import open_recording
 from lidar_perception.groups import group_points
 from lidar_perception.types import PEDESTRIAN, InputError, LidarFrame
@@ -33,7 +33,7 @@ def labelled(seed):
 
 @given(seeds, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-20, 20))
 def test_snapping_lowers_bottoms_to_the_plane_never_raises_them_and_keeps_tops(seed, a, b, c):
-    boxes = oriented_boxes(*labelled(seed), "axis_aligned")
+    boxes = fit_boxes(*labelled(seed), "axis_aligned")
     before = boxes.copy()
     snapped = snap_to_ground(boxes, np.array([a, b, c]))
     assert snapped.dtype == np.float32

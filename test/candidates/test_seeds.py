@@ -20,7 +20,7 @@ from lidar_perception.candidates.seeds import (
     seed_from_truth,
 )
 from lidar_perception.candidates.silhouette import to_pixels
-from lidar_perception.clustering.shapes import oriented_boxes
+from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.geometry import points_in_box
 from lidar_perception.types import InputError
 
@@ -56,7 +56,7 @@ def test_seed_from_truth_needs_a_pedestrian_with_ten_points():
 def clicked_scene():
     xyz = np.concatenate([person(6, 0), person(8, 3, seed=1)]).astype(np.float32)
     labels = np.repeat(np.int32([1, 2]), 400)
-    return xyz, labels, oriented_boxes(xyz, labels, "axis_aligned")
+    return xyz, labels, fit_boxes(xyz, labels, "axis_aligned")
 
 
 def test_seed_from_click_is_the_nearest_clusters():

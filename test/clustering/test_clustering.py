@@ -1,4 +1,4 @@
-"""Laws of DBSCAN and distance-aware DBSCAN, against scikit-learn's."""
+"""DBSCAN and distance-aware DBSCAN, compared with scikit-learn's DBSCAN."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from scipy.spatial import cKDTree
 from sklearn.cluster import DBSCAN
 
 from lidar_perception.clustering.dbscan import dbscan, distance_aware_dbscan
-from lidar_perception.clustering.dense import dbscan_by_cells
-from lidar_perception.clustering.growing import dbscan_by_growing
+from lidar_perception.clustering.dbscan_cells import dbscan_by_cells
+from lidar_perception.clustering.dbscan_growth import dbscan_by_growing
 from lidar_perception.clustering.params import DbscanParams
 from lidar_perception.ground.threshold import segment_by_threshold
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # other tests cover these lines
 
 SCANS = DATA / "kitti_object/training/velodyne_reduced"
 
 
 def reference(xyz, eps, min_samples):
-    """scikit-learn's labels, noise 0. It computes in float64, as ours."""
+    """Return scikit-learn's labels plus one: 0 for noise. Both compute in float64."""
     if len(xyz) == 0:
         return np.zeros(0, np.int32)
     model = DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree")
@@ -37,12 +37,12 @@ def core_mask(xyz, eps, min_samples):
 
 
 def partition(labels):
-    """The clusters as a set of sets of indices, whatever their numbers."""
+    """Return the clusters as a set of sets of indices, without their ids."""
     return {frozenset(np.flatnonzero(labels == k).tolist()) for k in np.unique(labels) if k > 0}
 
 
 def blobs(rng, centres, size, spread):
-    """Points (N, 3) float32 around centres (K, 3), and which centre each belongs to."""
+    """Return points (N, 3) float32 around centres (K, 3), and the centre of each, 0..K-1."""
     centres = np.asarray(centres, float)
     xyz = np.repeat(centres, size, axis=0) + rng.uniform(-spread, spread, (size * len(centres), 3))
     return xyz.astype(np.float32), np.repeat(np.arange(len(centres)), size)
@@ -56,23 +56,22 @@ def assert_same(xyz, eps, min_samples):
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.floats(0.05, 1.5), st.integers(1, 12),
        st.sampled_from([0.0, 50.0, 3000.0]))
-def test_labels_are_those_of_sklearn_on_random_points(seed, count, eps, min_samples, offset):
+def test_labels_equal_sklearn_on_random_points(seed, count, eps, min_samples, offset):
     rng = np.random.default_rng(seed)
     xyz = rng.uniform(-2, 2, (count, 3)) * rng.choice([0.1, 1.0, 2.0], 3) + offset
     assert_same(xyz.astype(np.float32), eps, min_samples)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 500), st.integers(1, 4), st.integers(1, 30))
-def test_labels_are_those_of_sklearn_on_a_grid_where_most_distances_tie(seed, count, reach,
-                                                                        min_samples):
-    # Multiples of 1/4: every distance is exact, and many are exactly eps.
+def test_labels_equal_sklearn_where_most_distances_tie(seed, count, reach, min_samples):
+    # Multiples of 1/4, so that distances are exact and many equal eps.
     xyz = np.random.default_rng(seed).integers(-6, 7, (count, 3)).astype(np.float32) / 4
     assert_same(xyz, reach / 4, min_samples)
 
 
 @pytest.mark.parametrize("min_samples", [2, 5, 6, 7, 27])
-def test_border_points_go_to_the_first_cluster_that_touches_them(min_samples):
-    # Dense balls so close that most border points lie between two of them.
+def test_border_points_join_the_first_cluster(min_samples):
+    # Dense balls so close that most border points are between two of them.
     rng = np.random.default_rng(3)
     xyz, _ = blobs(rng, [[0, 0, 0], [0.9, 0, 0], [0, 0.9, 0], [0.9, 0.9, 0.2]], 40, 0.25)
     bridge = rng.uniform(-0.2, 1.1, (60, 3)).astype(np.float32)
@@ -95,12 +94,12 @@ def test_border_points_go_to_the_first_cluster_that_touches_them(min_samples):
     ("plane", np.stack([*np.mgrid[0:4:0.25, 0:4:0.25], np.zeros((16, 16))], -1).reshape(-1, 3)),
 ])
 @pytest.mark.parametrize("min_samples", [1, 2, 3, 10, 100])
-def test_labels_are_those_of_sklearn_on_degenerate_clouds(name, xyz, min_samples):
+def test_labels_equal_sklearn_on_degenerate_clouds(name, xyz, min_samples):
     for eps in (0.125, 0.25, 0.5):
         assert_same(np.asarray(xyz, np.float32), eps, min_samples)
 
 
-def test_doubling_every_point_and_min_samples_keeps_the_clusters():
+def test_doubling_points_and_min_samples_keeps_the_clusters():
     rng = np.random.default_rng(5)
     xyz = rng.uniform(-1, 1, (300, 3)).astype(np.float32)
     once = dbscan(xyz, 0.3, 5)
@@ -109,7 +108,7 @@ def test_doubling_every_point_and_min_samples_keeps_the_clusters():
 
 @needs_data
 @pytest.mark.parametrize("scan", [0, 11, 23])
-def test_labels_are_those_of_sklearn_on_real_clouds(scan):
+def test_labels_equal_sklearn_on_real_clouds(scan):
     raw = np.fromfile(sorted(SCANS.glob("*.bin"))[scan], np.float32).reshape(-1, 4)
     xyz = raw[:, :3][~segment_by_threshold(np.ascontiguousarray(raw[:, :3]))]
     params = DbscanParams()
@@ -119,7 +118,7 @@ def test_labels_are_those_of_sklearn_on_real_clouds(scan):
 
 
 def banded_reference(xyz, params):
-    """Each band by itself, ids going on. The range is the float32 one, as documented."""
+    """Cluster each band with scikit-learn, with ids that continue; ranges are float32."""
     limits = [-np.inf, *params.range_limits, np.inf]
     ranges = np.sqrt(xyz[:, 0] * xyz[:, 0] + xyz[:, 1] * xyz[:, 1])
     labels, last = np.zeros(len(xyz), int), 0
@@ -132,7 +131,7 @@ def banded_reference(xyz, params):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 600), st.integers(1, 8))
-def test_distance_aware_is_sklearn_in_each_band(seed, count, min_samples):
+def test_distance_aware_equals_sklearn_in_each_band(seed, count, min_samples):
     rng = np.random.default_rng(seed)
     xyz = (rng.uniform(-6, 6, (count, 3)) * [1, 1, 0.2]).astype(np.float32)
     params = DbscanParams(range_limits=(2.0, 3.5, 5.0), eps=(0.2, 0.5, 0.3, 0.8),
@@ -143,8 +142,8 @@ def test_distance_aware_is_sklearn_in_each_band(seed, count, min_samples):
 
 @pytest.mark.parametrize("limit, at", [(15.0, [15, 0]), (15.0, [0, -15]), (15.0, [9, 12]),
                                        (30.0, [-18, 24])])
-def test_a_point_at_exactly_a_range_limit_belongs_to_the_far_band(limit, at):
-    # Pairs 0.25 m apart are clusters only beyond the limit, where eps is larger.
+def test_a_point_at_a_range_limit_is_in_the_far_band(limit, at):
+    # Points 0.25 m apart form a cluster only beyond the limit, where eps is larger.
     at = np.array([*at, 0], np.float32)
     inner = at * np.float32(1 - 1e-6)
     assert np.hypot(*inner[:2]) < limit
@@ -155,7 +154,7 @@ def test_a_point_at_exactly_a_range_limit_belongs_to_the_far_band(limit, at):
     assert distance_aware_dbscan(np.stack([inner, at + up]), params).tolist() == [0, 0]
 
 
-def test_a_cluster_across_a_range_limit_is_cut_there():
+def test_a_cluster_across_a_range_limit_is_split():
     xyz = np.zeros((200, 3), np.float32)
     xyz[:, 0] = np.linspace(14, 16, 200)
     labels = distance_aware_dbscan(xyz, DbscanParams())
@@ -166,7 +165,7 @@ JOIN = DbscanParams(join_bands=True)
 
 
 def slow_join(xyz, labels, params):
-    """Clusters of neighbouring bands with a pair of points within the smaller eps become one."""
+    """Join clusters of neighbouring bands with a pair of points within the smaller eps."""
     band = np.searchsorted(params.range_limits, np.hypot(*xyz[:, :2].T.astype(np.float32)), "right")
     joined = {frozenset([k]) for k in range(1, labels.max(initial=0) + 1)}
     for i, j in zip(*np.nonzero(np.abs(band[:, None] - band) == 1)):
@@ -178,7 +177,7 @@ def slow_join(xyz, labels, params):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 150))
-def test_join_bands_joins_what_touches_across_a_limit_and_nothing_else(seed, count):
+def test_join_bands_joins_touching_clusters_only(seed, count):
     rng = np.random.default_rng(seed)
     xyz = (rng.uniform(-6, 6, (count, 3)) * [1, 1, 0.1]).astype(np.float32)
     cut = DbscanParams(range_limits=(2.0, 4.0), eps=(0.9, 0.7, 1.0), min_samples=3)
@@ -190,7 +189,7 @@ def test_join_bands_joins_what_touches_across_a_limit_and_nothing_else(seed, cou
     assert len(set(found.tolist()) - {0}) == len(first)
 
 
-def test_join_bands_makes_one_of_a_cluster_across_a_limit():
+def test_join_bands_reunites_a_cluster_across_a_limit():
     xyz = np.zeros((200, 3), np.float32)
     xyz[:, 0] = np.linspace(14, 16, 200)
     assert distance_aware_dbscan(xyz, JOIN).tolist() == [1] * 200
@@ -205,7 +204,7 @@ def test_without_limits_distance_aware_is_plain_dbscan():
 
 
 @pytest.mark.parametrize("far", [[1e5, 0, 0], [0, -1e5, 0], [0, 0, 1e5], [-7e4, 7e4, -1e3]])
-def test_an_outlier_100_km_away_changes_nothing_near(far):
+def test_an_outlier_100_km_away_does_not_change_clusters(far):
     xyz = np.random.default_rng(7).uniform(-2, 2, (800, 3)).astype(np.float32)
     labels = dbscan(xyz, 0.4, 5)
     for place in (0, 400, 800):
@@ -216,8 +215,8 @@ def test_an_outlier_100_km_away_changes_nothing_near(far):
     np.testing.assert_array_equal(banded[:-1], distance_aware_dbscan(xyz))
 
 
-def test_clusters_100_km_away_are_found_as_near_ones_are():
-    # Steps of 1/64 m are exact in float32 out there.
+def test_clusters_100_km_away_are_found_like_near_ones():
+    # Steps of 1/64 m are exact in float32 at that distance.
     rng = np.random.default_rng(8)
     xyz = (rng.integers(-64, 64, (400, 3)) / 64).astype(np.float32)
     moved = xyz + np.float32([8e4, -6e4, 16])
@@ -226,7 +225,7 @@ def test_clusters_100_km_away_are_found_as_near_ones_are():
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_permuting_points_permutes_the_core_partition_and_the_noise(seed):
+def test_permuting_points_permutes_core_clusters_and_noise(seed):
     rng = np.random.default_rng(seed)
     xyz = rng.uniform(-1, 1, (250, 3)).astype(np.float32)
     order = rng.permutation(len(xyz))
@@ -240,7 +239,7 @@ def test_permuting_points_permutes_the_core_partition_and_the_noise(seed):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 300), st.integers(1, 8))
-def test_ids_are_1_to_K_by_first_core_point_and_every_cluster_has_a_core(seed, count, min_samples):
+def test_ids_are_1_to_K_by_first_core_point(seed, count, min_samples):
     rng = np.random.default_rng(seed)
     xyz = rng.uniform(-2, 2, (count, 3)).astype(np.float32)
     labels = dbscan(xyz, 0.5, min_samples)
@@ -253,7 +252,7 @@ def test_ids_are_1_to_K_by_first_core_point_and_every_cluster_has_a_core(seed, c
     assert np.unique(banded[banded > 0]).tolist() == list(range(1, banded.max() + 1))
 
 
-def test_min_samples_1_leaves_no_noise_and_gives_the_connected_components():
+def test_min_samples_1_gives_the_connected_components():
     xyz = np.random.default_rng(2).uniform(-3, 3, (400, 3)).astype(np.float32)
     labels = dbscan(xyz, 0.5, 1)
     assert labels.min() == 1
@@ -289,7 +288,7 @@ def test_translation_keeps_well_separated_clusters(x, y, z):
     assert partition(labels) == partition(blob + 1)
 
 
-def test_input_of_any_layout_and_dtype_gives_the_same_labels_and_stays_unchanged():
+def test_layout_and_dtype_of_the_input_do_not_matter():
     xyz = np.random.default_rng(17).uniform(-1, 1, (300, 3)).astype(np.float32)
     labels, before = dbscan(xyz, 0.3, 4), xyz.copy()
     np.testing.assert_array_equal(dbscan(np.asfortranarray(xyz), 0.3, 4), labels)
@@ -303,11 +302,11 @@ def test_input_of_any_layout_and_dtype_gives_the_same_labels_and_stays_unchanged
 
 
 def test_a_million_equal_points_are_one_cluster():
-    # A list of neighbours for each would be a million millions.
+    # Neighbour lists would need 10^12 entries.
     assert (dbscan(np.full((1_000_000, 3), 1.7, np.float32), 0.15, 10) == 1).all()
 
 
-def test_two_dense_places_within_eps_are_one_cluster_however_many_points():
+def test_two_dense_places_within_eps_are_one_cluster():
     xyz = np.zeros((400_000, 3), np.float32)
     xyz[::2, 1] = 0.14
     assert (dbscan(xyz, 0.15, 10) == 1).all()
@@ -316,25 +315,25 @@ def test_two_dense_places_within_eps_are_one_cluster_however_many_points():
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 300),
        scale=st.sampled_from([0.3, 1.0, 4.0]), eps=st.sampled_from([0.1, 0.25, 0.5]),
        min_samples=st.integers(1, 12))
-def test_by_cells_and_by_pairs_the_labels_are_scikit_learns(seed, n, scale, eps, min_samples):
+def test_both_implementations_equal_sklearn(seed, n, scale, eps, min_samples):
     rng = np.random.default_rng(seed)
     xyz = (rng.random((n, 3)) * scale).astype(np.float32)
     if seed % 2:
-        xyz = np.round(xyz * 20) / np.float32(20)  # many ties at exactly eps
+        xyz = np.round(xyz * 20) / np.float32(20)  # many distances equal eps
     expected = DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree").fit(xyz).labels_ + 1
     np.testing.assert_array_equal(dbscan_by_cells(xyz, eps, min_samples), expected)
     np.testing.assert_array_equal(dbscan_by_growing(xyz, eps, min_samples), expected)
 
 
-def test_dense_points_are_refused_by_pairs_before_they_cost_much():
+def test_dbscan_by_growing_refuses_dense_points():
     assert dbscan_by_growing(np.zeros((100_000, 3), np.float32), 0.5, 10) is None
 
 
-def test_a_forked_process_clusters_too():
-    """It has none of the threads that its parent keeps for the bands."""
+def test_a_forked_process_can_cluster():
+    """A forked process does not have the threads that its parent keeps for the bands."""
     xyz = np.random.default_rng(0).uniform(-40, 40, (500, 3)).astype(np.float32)
     labels = distance_aware_dbscan(xyz)
-    child = multiprocessing.get_context("fork").Process(target=_same, args=(xyz, labels))
+    child = multiprocessing.get_context("fork").Process(target=assert_labels, args=(xyz, labels))
     child.start()
     child.join(30)
     if child.is_alive():
@@ -342,5 +341,5 @@ def test_a_forked_process_clusters_too():
     assert child.exitcode == 0
 
 
-def _same(xyz, labels):
+def assert_labels(xyz, labels):
     np.testing.assert_array_equal(distance_aware_dbscan(xyz), labels)

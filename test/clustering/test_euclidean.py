@@ -1,4 +1,4 @@
-"""Adaptive Euclidean clustering (paper C): equal to a plain SciPy reading of the same equations."""
+"""Adaptive Euclidean clustering (paper C) equals a plain SciPy implementation of the equations."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmark.plain_euclidean import euclidean as plain
-from lidar_perception.clustering.euclidean import euclidean
+from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import EuclideanParams
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # other tests cover these lines
 
 LOCAL = EuclideanParams()
 SETTINGS = [LOCAL, replace(LOCAL, gamma=0.0), replace(LOCAL, threshold="global", gamma=0.0),
             replace(LOCAL, threshold="global", min_size=3), replace(LOCAL, beta=0.0, min_size=1)]
-NAMES = ["local", "local, not merged", "global, not merged", "global", "no MinPts"]
+SETTING_NAMES = ["local", "local, not merged", "global, not merged", "global", "no MinPts"]
 
 
 def blobs(seed, centres, count=200, spread=0.15):
@@ -29,7 +29,7 @@ def blobs(seed, centres, count=200, spread=0.15):
 
 
 def scene(seed, count=3000):
-    """Dense and thin clusters, lines, walls, single points."""
+    """Return a cloud of dense and sparse clusters, a line and single points."""
     rng = np.random.default_rng(seed)
     return np.concatenate([
         blobs(seed, rng.uniform(-20, 20, (8, 3)) * [1, 1, 0.1], count // 10, 0.2),
@@ -60,26 +60,27 @@ DEGENERATE = {
 }
 
 
-@pytest.mark.parametrize("params", SETTINGS, ids=NAMES)
+@pytest.mark.parametrize("params", SETTINGS, ids=SETTING_NAMES)
 @pytest.mark.parametrize("xyz", DEGENERATE.values(), ids=DEGENERATE)
-def test_degenerate_clouds_give_the_labels_of_the_plain_reading(xyz, params):
+def test_degenerate_clouds_equal_the_plain_implementation(xyz, params):
     xyz = np.asarray(xyz, np.float32)
-    labels = euclidean(xyz, params)
+    labels = cluster_euclidean(xyz, params)
     assert labels.dtype == np.int32 and labels.shape == (len(xyz),)
     np.testing.assert_array_equal(labels, plain(xyz, params))
 
 
-@pytest.mark.parametrize("params", SETTINGS, ids=NAMES)
+@pytest.mark.parametrize("params", SETTINGS, ids=SETTING_NAMES)
 @pytest.mark.parametrize("seed", range(3))
-def test_scenes_give_the_labels_of_the_plain_reading(seed, params):
-    labels = euclidean(scene(seed), params)
+def test_scenes_equal_the_plain_implementation(seed, params):
+    labels = cluster_euclidean(scene(seed), params)
     np.testing.assert_array_equal(labels, plain(scene(seed), params))
-    assert labels.max() > 3 and ((labels == 0).any() or params.beta == 0)  # it says something
+    # The comparison is not trivial.
+    assert labels.max() > 3 and ((labels == 0).any() or params.beta == 0)
 
 
 @given(st.data())
-def test_any_cloud_gives_the_labels_of_the_plain_reading(data):
-    """Coordinates on a coarse lattice: equal distances and thresholds met exactly are common."""
+def test_lattice_clouds_equal_the_plain_implementation(data):
+    """On a coarse lattice, equal distances and distances equal to a threshold are common."""
     count = data.draw(st.integers(1, 60))
     step = data.draw(st.sampled_from([0.05, 0.125, 0.3, 2.0]))
     rows = data.draw(st.lists(st.tuples(*[st.integers(-6, 6)] * 3), min_size=count,
@@ -92,11 +93,11 @@ def test_any_cloud_gives_the_labels_of_the_plain_reading(data):
         radius=data.draw(st.sampled_from([0.125, 0.5])),
         min_size=data.draw(st.integers(1, 6)))
     xyz = (np.array(rows) * step).astype(np.float32)
-    np.testing.assert_array_equal(euclidean(xyz, params), plain(xyz, params))
+    np.testing.assert_array_equal(cluster_euclidean(xyz, params), plain(xyz, params))
 
 
 @pytest.mark.parametrize("threshold", ["local", "global"])
-def test_a_real_scan_gives_the_labels_of_the_plain_reading(threshold, data):
+def test_a_real_scan_equals_the_plain_implementation(threshold, data):
     from lidar_perception.ground.params import GroundParams
     from lidar_perception.ground.segment import segment_ground
     from lidar_perception.types import LidarFrame
@@ -107,70 +108,72 @@ def test_a_real_scan_gives_the_labels_of_the_plain_reading(threshold, data):
     ground = segment_ground(frame, GroundParams(method="cloth"))
     xyz = frame.xyz[~ground][::3]
     params = replace(LOCAL, threshold=threshold, gamma=0.0 if threshold == "global" else 0.8)
-    np.testing.assert_array_equal(euclidean(xyz, params), plain(xyz, params))
+    np.testing.assert_array_equal(cluster_euclidean(xyz, params), plain(xyz, params))
 
 
-@pytest.mark.parametrize("params", SETTINGS, ids=NAMES)
-def test_permuting_the_points_permutes_the_labels(params):
+@pytest.mark.parametrize("params", SETTINGS, ids=SETTING_NAMES)
+def test_permuting_points_permutes_labels(params):
     xyz, order = scene(5), np.random.default_rng(0).permutation(len(scene(5)))
-    a, b = euclidean(xyz, params)[order], euclidean(xyz[order], params)
+    a, b = cluster_euclidean(xyz, params)[order], cluster_euclidean(xyz[order], params)
     assert same_partition(a, b)
     first = b[np.sort(np.unique(b, return_index=True)[1])]
-    assert np.array_equal(first[first > 0], np.arange(1, b.max() + 1))  # by their first point
+    # Clusters are numbered by their first point.
+    assert np.array_equal(first[first > 0], np.arange(1, b.max() + 1))
 
 
-@pytest.mark.parametrize("params", SETTINGS[:2], ids=NAMES[:2])
-def test_moving_and_turning_the_cloud_changes_nothing(params):
-    """Of clusters that no rounding can join or part."""
+@pytest.mark.parametrize("params", SETTINGS[:2], ids=SETTING_NAMES[:2])
+def test_moving_and_rotating_the_cloud_changes_nothing(params):
+    """The clusters are far enough apart for rounding not to matter."""
     xyz = blobs(3, [[0, 0, 0], [8, 0, 0], [0, 9, 1], [-7, -7, 0]])
     turn = np.array([[np.cos(0.7), -np.sin(0.7), 0], [np.sin(0.7), np.cos(0.7), 0], [0, 0, 1]])
     moved = (xyz.astype(float) @ turn.T + [30, -20, 1]).astype(np.float32)
-    labels = euclidean(xyz, params)
+    labels = cluster_euclidean(xyz, params)
     assert labels.max() >= 4
-    # The axis-aligned diameter of the merging depends on the direction; the clusters do not.
-    without = replace(params, gamma=0.0)
-    assert (euclidean(xyz, without) == euclidean(moved, without)).mean() > 0.999
-    np.testing.assert_array_equal(euclidean(xyz + np.float32([16, -32, 0]), params) > 0, labels > 0)
+    # The diameter for merging is axis-aligned, so it depends on the rotation; the clusters do not.
+    unmerged = replace(params, gamma=0.0)
+    assert (cluster_euclidean(xyz, unmerged) == cluster_euclidean(moved, unmerged)).mean() > 0.999
+    shifted = cluster_euclidean(xyz + np.float32([16, -32, 0]), params)
+    np.testing.assert_array_equal(shifted > 0, labels > 0)
 
 
-def test_far_outliers_change_nothing_near_with_the_local_threshold():
+def test_far_outliers_do_not_change_local_thresholds():
     xyz, far = scene(2), np.float32([[5e4, 0, 0], [0, -9e4, 10], [1e5, 1e5, 1e5]])
-    # MinPts = beta ln N counts all points (Eq. 7): three more do not pass the next integer here.
+    # MinPts = beta ln N counts all points (Eq. 7); three more do not reach the next integer here.
     assert np.ceil(0.5 * np.log(len(xyz))) == np.ceil(0.5 * np.log(len(xyz) + 3))
-    labels = euclidean(np.concatenate([xyz, far]), LOCAL)
-    np.testing.assert_array_equal(labels[:-3], euclidean(xyz, LOCAL))
+    labels = cluster_euclidean(np.concatenate([xyz, far]), LOCAL)
+    np.testing.assert_array_equal(labels[:-3], cluster_euclidean(xyz, LOCAL))
     assert not labels[-3:].any()
 
 
-def test_min_size_drops_clusters_and_nothing_else():
+def test_min_size_only_drops_small_clusters():
     xyz, base = scene(1), replace(LOCAL, gamma=0.0)
-    every = euclidean(xyz, replace(base, min_size=1))
-    size = np.bincount(every)[every]
-    for least in (2, 10, 40):
-        labels = euclidean(xyz, replace(base, min_size=least))
-        assert same_partition(labels, np.where(size >= least, every, 0))
+    unfiltered = cluster_euclidean(xyz, replace(base, min_size=1))
+    size = np.bincount(unfiltered)[unfiltered]
+    for min_size in (2, 10, 40):
+        labels = cluster_euclidean(xyz, replace(base, min_size=min_size))
+        assert same_partition(labels, np.where(size >= min_size, unfiltered, 0))
 
 
-def test_gamma_merges_what_lies_nearer_than_the_mean_of_the_diameters():
-    """Two boxes of diagonal 2: centres 1.5 apart are nearer than 0.8 times 2, 1.7 apart not."""
+def test_gamma_merges_clusters_nearer_than_their_diameters():
+    """The boxes have diagonal 2: centres 1.5 apart are nearer than 0.8 * 2, 1.7 apart are not."""
     def walls(distance):
         line = np.linspace(-1, 1, 60)
         one = np.stack([np.zeros(60), line, np.zeros(60)], axis=1)
         return np.concatenate([one, one + [distance, 0, 0]]).astype(np.float32)
     params = replace(LOCAL, radius=0.3)
-    assert euclidean(walls(1.5), params).max() == 1
-    assert euclidean(walls(1.7), params).max() == 2
-    assert euclidean(walls(1.5), replace(params, gamma=0.0)).max() == 2
+    assert cluster_euclidean(walls(1.5), params).max() == 1
+    assert cluster_euclidean(walls(1.7), params).max() == 2
+    assert cluster_euclidean(walls(1.5), replace(params, gamma=0.0)).max() == 2
 
 
-def test_the_local_threshold_follows_the_density():
-    """Points 0.4 m apart, as on a far car, are one cluster beside walls with points 2 cm apart;
-    one threshold for all of them finds only the dense ones: why Eq. 11 is the default."""
+def test_local_threshold_adapts_to_the_density():
+    """Why Eq. 11 is the default: it finds a wall with points 2 cm apart and, in the same cloud, one
+    with points 0.4 m apart, as on a far car. One threshold finds the dense wall only."""
     def wall(x, step):
         y, z = np.meshgrid(np.arange(0, 2.01, step), np.arange(0, 1.61, step))
         return np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1)
     xyz = np.concatenate([wall(0, 0.02), wall(40, 0.4)]).astype(np.float32)
-    labels = euclidean(xyz, LOCAL)
+    labels = cluster_euclidean(xyz, LOCAL)
     assert labels.max() == 2 and (labels == 0).sum() < 5  # corners have few neighbours
-    one = euclidean(xyz, replace(LOCAL, threshold="global"))
+    one = cluster_euclidean(xyz, replace(LOCAL, threshold="global"))
     assert one.max() == 1 and not one[-30:].any()

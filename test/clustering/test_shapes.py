@@ -1,4 +1,4 @@
-"""Laws of the boxes, ellipses and classes of clusters."""
+"""Boxes, ellipses and classes of clusters."""
 
 from __future__ import annotations
 
@@ -11,46 +11,46 @@ from samples import DATA, needs_data
 from scipy.spatial import ConvexHull
 
 from lidar_perception.clustering.params import BOX_SHAPES
-from lidar_perception.clustering.shapes import class_by_diagonal, ellipses, oriented_boxes
+from lidar_perception.clustering.shapes import classify_by_diagonal, fit_boxes, fit_ellipses
 from lidar_perception.data.open import open_recording
 from lidar_perception.geometry import box_corners, points_in_box
 from lidar_perception.types import CLASSES
 
 seeds = st.integers(0, 2**32 - 1)
-QUARTER = np.float32(np.pi / 2)  # of a turn
+QUARTER_TURN = np.float32(np.pi / 2)
 each_shape = pytest.mark.parametrize("shape", BOX_SHAPES)
 each_oriented = pytest.mark.parametrize("shape", ["min_area", "l_shape"])
 
 
-def turned(xyz, yaw):
+def rotate(xyz, yaw):
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.asarray(xyz, float) @ [[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]
 
 
-def some_clusters(seed, most=60):
-    """Points (N, 3) float32 of several clusters in mixed order, and labels with some noise."""
+def make_clusters(seed):
+    """Return points (N, 3) float32 of several clusters in mixed order, and labels with noise."""
     rng = np.random.default_rng(seed)
     parts = []
     for k in range(1, rng.integers(2, 9)):
-        size = rng.integers(1, most)
+        size = rng.integers(1, 60)
         flat = rng.normal(size=(size, 3)) * rng.uniform(0.02, 3, 3)
         if k % 3 == 0:
-            flat = np.round(flat * 2) / 2  # ties, and many points at one place
-        parts.append(np.column_stack([turned(flat, rng.uniform(-4, 4)) + rng.uniform(-60, 60, 3),
+            flat = np.round(flat * 2) / 2  # ties and coincident points
+        parts.append(np.column_stack([rotate(flat, rng.uniform(-4, 4)) + rng.uniform(-60, 60, 3),
                                       np.full(size, k)]))
     noise = np.column_stack([rng.uniform(-60, 60, (20, 3)), np.zeros(20)])
     mixed = rng.permutation(np.concatenate([noise, *parts]))
     return mixed[:, :3].astype(np.float32), mixed[:, 3].astype(np.int32)
 
 
-def one(function, xyz, *rest):
-    """The row of points that are one cluster."""
+def apply_to_one(function, xyz, *rest):
+    """Return the function's row for points that form one cluster."""
     xyz = np.asarray(xyz, np.float32).reshape(-1, 3)
     return function(xyz, np.ones(len(xyz), np.int32), *rest)[0]
 
 
 def least_area(xy):
-    """Area of the smallest rectangle: over all edges of SciPy's hull."""
+    """Return the area of the smallest rectangle, over all edges of SciPy's hull."""
     hull = ConvexHull(xy.astype(float))
     normals = hull.equations[:, :2]
     along = normals @ [[0, 1], [-1, 0]] @ hull.points.T
@@ -58,7 +58,7 @@ def least_area(xy):
 
 
 def l_shaped_car(rng, yaw, noise=0.01):
-    """Points on the two sides of a car that a sensor at the origin sees, and its box."""
+    """Return points on the two visible sides of a car, and its box."""
     length, width, height = rng.uniform(3.6, 4.8), rng.uniform(1.5, 1.9), rng.uniform(1.3, 1.7)
     first, second = rng.integers(60, 150), rng.integers(40, 80)
     x = np.concatenate([np.linspace(-1, 1, first), np.full(second, -1)]) * length / 2
@@ -66,7 +66,7 @@ def l_shaped_car(rng, yaw, noise=0.01):
     flat = np.column_stack([x, y, rng.uniform(-0.5, 0.5, len(x)) * height])
     flat[:, :2] += rng.uniform(-noise, noise, (len(x), 2))
     centre = rng.uniform(-30, 30, 3)
-    return ((turned(flat, yaw) + centre).astype(np.float32),
+    return ((rotate(flat, yaw) + centre).astype(np.float32),
             np.array([*centre, length, width, height, yaw]))
 
 
@@ -74,24 +74,24 @@ def angle_between(a, b, period=np.pi):
     return np.abs((np.asarray(a) - b + period / 2) % period - period / 2)
 
 
-def assert_turned(before, after, angle, atol):
-    """The box after is the box before turned about z, whichever corner comes first."""
+def assert_rotated(before, after, angle, atol):
+    """Assert that `after` is `before` rotated about z, with corners in any order."""
     found, expected = box_corners(np.stack([after, before]))[:, :4]
-    distances = np.linalg.norm(found[:, None] - turned(expected, angle), axis=2)
+    distances = np.linalg.norm(found[:, None] - rotate(expected, angle), axis=2)
     assert distances.min(axis=1).max() < atol and distances.min(axis=0).max() < atol
 
 
 @each_shape
 @given(seeds)
-def test_a_box_holds_all_its_points_and_is_no_larger_than_they_need(shape, seed):
-    xyz, labels = some_clusters(seed)
-    boxes = oriented_boxes(xyz, labels, shape)
+def test_a_box_is_the_smallest_that_holds_its_points(shape, seed):
+    xyz, labels = make_clusters(seed)
+    boxes = fit_boxes(xyz, labels, shape)
     assert boxes.dtype == np.float32 and boxes.shape == (labels.max(), 7)
     for k, box in enumerate(boxes, 1):
         members = xyz[labels == k]
         assert points_in_box(members, box, 1e-4).all()
         assert box[5] == pytest.approx(np.ptp(members[:, 2]), abs=1e-5)
-        for side in range(2):  # nor is it longer or wider than they are
+        for side in range(2):
             smaller = box.copy()
             smaller[3 + side] -= 1e-3
             assert smaller[3 + side] < 0 or not points_in_box(members, smaller).all()
@@ -99,16 +99,16 @@ def test_a_box_holds_all_its_points_and_is_no_larger_than_they_need(shape, seed)
 
 @each_oriented
 @given(seeds)
-def test_oriented_boxes_are_longer_than_wide_and_yaw_is_that_of_a_line(shape, seed):
-    boxes = oriented_boxes(*some_clusters(seed), shape)
+def test_rotated_boxes_are_longer_than_wide(shape, seed):
+    boxes = fit_boxes(*make_clusters(seed), shape)
     assert (boxes[:, 3] >= boxes[:, 4]).all() and (boxes[:, 4:6] >= 0).all()
-    assert (boxes[:, 6] >= -QUARTER).all() and (boxes[:, 6] < QUARTER).all()
+    assert (boxes[:, 6] >= -QUARTER_TURN).all() and (boxes[:, 6] < QUARTER_TURN).all()
 
 
 @given(seeds)
-def test_axis_aligned_boxes_are_the_min_and_max_of_each_cluster(seed):
-    xyz, labels = some_clusters(seed)
-    boxes = oriented_boxes(xyz, labels, "axis_aligned")
+def test_axis_aligned_boxes_span_minimum_to_maximum(seed):
+    xyz, labels = make_clusters(seed)
+    boxes = fit_boxes(xyz, labels, "axis_aligned")
     assert boxes.shape == (labels.max(), 7) and boxes.dtype == np.float32
     for k, box in enumerate(boxes, start=1):
         low, high = xyz[labels == k].min(axis=0), xyz[labels == k].max(axis=0)
@@ -116,18 +116,18 @@ def test_axis_aligned_boxes_are_the_min_and_max_of_each_cluster(seed):
 
 
 @given(seeds, st.floats(0, 2 * np.pi))
-def test_min_area_is_the_least_area(seed, angle):
+def test_min_area_has_the_least_area(seed, angle):
     rng = np.random.default_rng(seed)
-    xyz = turned(rng.normal(size=(rng.integers(4, 300), 3)) * [3, 1, 1], rng.uniform(0, 4))
+    xyz = rotate(rng.normal(size=(rng.integers(4, 300), 3)) * [3, 1, 1], rng.uniform(0, 4))
     xyz = (xyz + rng.uniform(-50, 50, 3)).astype(np.float32)
-    box = one(oriented_boxes, xyz, "min_area").astype(float)
+    box = apply_to_one(fit_boxes, xyz, "min_area").astype(float)
     area = box[3] * box[4]
     assert area == pytest.approx(least_area(xyz[:, :2]), rel=1e-5)
     _, sides, _ = cv2.minAreaRect(xyz[:, :2] - xyz[0, :2])
     assert area <= sides[0] * sides[1] * (1 + 1e-4)
-    spans = np.ptp(turned(xyz, angle), axis=0)
+    spans = np.ptp(rotate(xyz, angle), axis=0)
     assert area <= spans[0] * spans[1] * (1 + 1e-6)
-    for other in (one(oriented_boxes, xyz, shape) for shape in BOX_SHAPES):
+    for other in (apply_to_one(fit_boxes, xyz, shape) for shape in BOX_SHAPES):
         assert area <= other[3] * other[4] * (1 + 1e-5)
 
 
@@ -136,67 +136,67 @@ def test_min_area_of_points_that_are_all_corners(seed, count, radius):
     angles = np.random.default_rng(seed).uniform(0, 2 * np.pi, count)
     xyz = np.column_stack([np.cos(angles), 0.7 * np.sin(angles), angles]) * radius
     xyz = xyz.astype(np.float32)
-    box = one(oriented_boxes, xyz, "min_area").astype(float)
+    box = apply_to_one(fit_boxes, xyz, "min_area").astype(float)
     assert box[3] * box[4] == pytest.approx(least_area(xyz[:, :2]), rel=1e-5)
 
 
 @given(seeds, st.floats(-10, 10))
-def test_turning_a_cloud_turns_its_least_rectangle(seed, angle):
-    # Points that fill a rectangle, and its corners: no other rectangle comes near.
+def test_rotating_a_cloud_rotates_its_min_area_box(seed, angle):
+    # Points that fill a rectangle, and its corners: no other rectangle has a similar area.
     rng = np.random.default_rng(seed)
     sides = np.array([rng.uniform(3, 5), rng.uniform(1, 2), 1])
     corners = [[1, 1, 1], [1, -1, 1], [-1, -1, 1], [-1, 1, 1]]
     flat = np.concatenate([rng.uniform(-1, 1, (100, 3)), corners]) * sides / 2
-    xyz = turned(flat, rng.uniform(0, 7)) + rng.uniform(-20, 20, 3)
-    before = one(oriented_boxes, xyz, "min_area")
-    assert_turned(before, one(oriented_boxes, turned(xyz, angle), "min_area"), angle, 1e-4)
+    xyz = rotate(flat, rng.uniform(0, 7)) + rng.uniform(-20, 20, 3)
+    before = apply_to_one(fit_boxes, xyz, "min_area")
+    assert_rotated(before, apply_to_one(fit_boxes, rotate(xyz, angle), "min_area"), angle, 1e-4)
 
 
 @given(seeds, st.integers(-720, 720).map(np.radians))
-def test_turning_a_car_turns_its_fitted_rectangle(seed, angle):
-    # By whole degrees the angles that are tried are the same.
+def test_rotating_a_car_rotates_its_l_shape_box(seed, angle):
+    # A rotation by whole degrees maps the angles that are tried onto themselves.
     rng = np.random.default_rng(seed)
     xyz, _ = l_shaped_car(rng, np.radians(rng.integers(0, 360) + 0.2))
-    before = one(oriented_boxes, xyz, "l_shape")
-    assert_turned(before, one(oriented_boxes, turned(xyz, angle), "l_shape"), angle, 1e-3)
+    before = apply_to_one(fit_boxes, xyz, "l_shape")
+    assert_rotated(before, apply_to_one(fit_boxes, rotate(xyz, angle), "l_shape"), angle, 1e-3)
 
 
 @given(seeds, st.floats(-np.pi, np.pi))
-def test_l_shape_recovers_a_car_of_which_two_sides_are_seen(seed, yaw):
+def test_l_shape_recovers_a_car_from_two_sides(seed, yaw):
     xyz, car = l_shaped_car(np.random.default_rng(seed), yaw)
-    box = one(oriented_boxes, xyz, "l_shape")
+    box = apply_to_one(fit_boxes, xyz, "l_shape")
     assert np.degrees(angle_between(box[6], yaw)) < 2
     assert np.linalg.norm(box[:2] - car[:2]) < 0.05
     np.testing.assert_allclose(box[3:5], car[3:5], atol=0.1)
 
 
-def test_l_shape_finds_the_sides_where_the_least_rectangle_does_not():
-    # Two sides as far as each other: a triangle, whose least rectangle lies along the longest.
+def test_l_shape_finds_sides_that_min_area_misses():
+    # Two equally long sides form a triangle; its smallest rectangle is along the longest edge.
     side, rng = np.linspace(0, 1.6, 80), np.random.default_rng(0)
     flat = np.zeros((160, 3))
     flat[:80, 0] = flat[80:, 1] = side
-    xyz = turned(flat + rng.uniform(-0.01, 0.01, flat.shape), 0.5)
-    yaws = [one(oriented_boxes, xyz, shape)[6] for shape in ("l_shape", "min_area")]
+    xyz = rotate(flat + rng.uniform(-0.01, 0.01, flat.shape), 0.5)
+    yaws = [apply_to_one(fit_boxes, xyz, shape)[6] for shape in ("l_shape", "min_area")]
     errors = np.degrees(angle_between(yaws, 0.5, np.pi / 2))
     assert errors[0] < 1 and errors[1] > 30
 
 
 @each_shape
 @given(seeds)
-def test_the_order_of_the_points_makes_no_difference(shape, seed):
-    xyz, labels = some_clusters(seed)
+def test_the_order_of_the_points_does_not_matter(shape, seed):
+    xyz, labels = make_clusters(seed)
     order = np.random.default_rng(seed).permutation(len(xyz))
-    np.testing.assert_array_equal(oriented_boxes(xyz[order], labels[order], shape),
-                                  oriented_boxes(xyz, labels, shape))
+    np.testing.assert_array_equal(fit_boxes(xyz[order], labels[order], shape),
+                                  fit_boxes(xyz, labels, shape))
 
 
 @each_shape
-def test_each_cluster_has_the_box_that_it_has_alone(shape):
-    xyz, labels = some_clusters(5)
-    boxes, rounds = oriented_boxes(xyz, labels, shape), ellipses(xyz, labels)
+def test_a_cluster_has_the_same_box_alone(shape):
+    xyz, labels = make_clusters(5)
+    boxes, rounds = fit_boxes(xyz, labels, shape), fit_ellipses(xyz, labels)
     for k, (box, ellipse) in enumerate(zip(boxes, rounds), 1):
-        np.testing.assert_array_equal(box, one(oriented_boxes, xyz[labels == k], shape))
-        np.testing.assert_array_equal(ellipse, one(ellipses, xyz[labels == k]))
+        np.testing.assert_array_equal(box, apply_to_one(fit_boxes, xyz[labels == k], shape))
+        np.testing.assert_array_equal(ellipse, apply_to_one(fit_ellipses, xyz[labels == k]))
 
 
 @pytest.mark.parametrize("name, xyz, length, yaw", [
@@ -208,82 +208,82 @@ def test_each_cluster_has_the_box_that_it_has_alone(shape):
     ("zero of either sign", [[0.0, 3, 0], [-0.0, 7, 0], [0.0, 1, 0], [-0.0, 5, 0]], 6, -np.pi / 2),
     ("almost along y", [[0, 0, 0], [1e-8, 5, 0]], 5, -np.pi / 2),
     ("slanted", np.outer(np.linspace(0, 7, 2), [np.cos(0.123), np.sin(0.123), 0]), 7, 0.123),
-    ("the other way", np.outer(np.linspace(0, 7, 333), [0.6, -0.8, 0]), 7, np.arctan2(-4, 3)),
+    ("slanted back", np.outer(np.linspace(0, 7, 333), [0.6, -0.8, 0]), 7, np.arctan2(-4, 3)),
 ])
 def test_points_at_one_place_or_on_a_line(name, xyz, length, yaw):
     for shape in ("min_area", "l_shape"):
-        box = one(oriented_boxes, xyz, shape)
+        box = apply_to_one(fit_boxes, xyz, shape)
         np.testing.assert_allclose(box[3:5], [length, 0], atol=2e-6)
-        assert angle_between(box[6], yaw) < 1e-5 and -QUARTER <= box[6] < QUARTER
-    ellipse = one(ellipses, xyz)
+        assert angle_between(box[6], yaw) < 1e-5 and -QUARTER_TURN <= box[6] < QUARTER_TURN
+    ellipse = apply_to_one(fit_ellipses, xyz)
     assert ellipse[2] >= length / 2 and ellipse[3] == pytest.approx(0, abs=1e-5)
     assert length == 0 or angle_between(ellipse[4], yaw) < 1e-5
 
 
 @each_shape
-def test_without_points_or_clusters_there_are_no_boxes_and_an_unused_id_has_zeros(shape):
-    nothing = np.zeros((0, 3), np.float32), np.zeros(0, np.int32)
+def test_no_clusters_give_no_boxes_and_unused_ids_zeros(shape):
+    empty = np.zeros((0, 3), np.float32), np.zeros(0, np.int32)
     noise = np.ones((5, 3), np.float32), np.zeros(5, np.int32)
-    for cloud in (nothing, noise):
-        assert (oriented_boxes(*cloud, shape).shape, ellipses(*cloud).shape) == ((0, 7), (0, 5))
+    for cloud in (empty, noise):
+        assert (fit_boxes(*cloud, shape).shape, fit_ellipses(*cloud).shape) == ((0, 7), (0, 5))
     xyz, labels = np.array([[1, 2, 3], [2, 2, 5], [9, 9, 9]], np.float32), np.array([3, 3, 0])
-    assert not oriented_boxes(xyz, labels, shape)[:2].any() and not ellipses(xyz, labels)[:2].any()
-    np.testing.assert_array_equal(oriented_boxes(xyz, labels, shape)[2], [1.5, 2, 4, 1, 0, 2, 0])
+    assert not fit_boxes(xyz, labels, shape)[:2].any() and not fit_ellipses(xyz, labels)[:2].any()
+    np.testing.assert_array_equal(fit_boxes(xyz, labels, shape)[2], [1.5, 2, 4, 1, 0, 2, 0])
     with pytest.raises(ValueError, match="'round' must be one of axis_aligned, min_area, l_shape"):
-        oriented_boxes(xyz, labels, "round")
+        fit_boxes(xyz, labels, "round")
 
 
 @each_shape
-def test_input_of_any_layout_and_dtype_gives_the_same_boxes_and_stays_unchanged(shape):
-    xyz, labels = some_clusters(9)
-    boxes, before = oriented_boxes(xyz, labels, shape), xyz.copy()
+def test_layout_and_dtype_of_the_input_do_not_matter(shape):
+    xyz, labels = make_clusters(9)
+    boxes, before = fit_boxes(xyz, labels, shape), xyz.copy()
     for same in (np.asfortranarray(xyz), xyz.astype(float), np.hstack([xyz, xyz])[:, :3]):
-        np.testing.assert_array_equal(oriented_boxes(same, labels, shape), boxes)
-        np.testing.assert_array_equal(ellipses(same, labels), ellipses(xyz, labels))
+        np.testing.assert_array_equal(fit_boxes(same, labels, shape), boxes)
+        np.testing.assert_array_equal(fit_ellipses(same, labels), fit_ellipses(xyz, labels))
     np.testing.assert_array_equal(xyz, before)
 
 
 @given(seeds, st.floats(-np.pi / 2, np.pi / 2), st.floats(0.2, 0.8))
-def test_an_ellipse_filled_evenly_is_recovered(seed, yaw, ratio):
+def test_an_evenly_filled_ellipse_is_recovered(seed, yaw, ratio):
     rng = np.random.default_rng(seed)
     radius, angle = np.sqrt(rng.uniform(0, 1, 20_000)), rng.uniform(0, 2 * np.pi, 20_000)
     axes = 3 * np.array([1, ratio])
     flat = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), angle]) * [*axes, 1]
     centre = rng.uniform(-40, 40, 3)
-    ellipse = one(ellipses, turned(flat, yaw) + centre)
+    ellipse = apply_to_one(fit_ellipses, rotate(flat, yaw) + centre)
     np.testing.assert_allclose(ellipse[:2], centre[:2], atol=0.08)
     np.testing.assert_allclose(ellipse[2:4], axes, rtol=0.03)
     assert angle_between(ellipse[4], yaw) < 0.1
-    assert -QUARTER <= ellipse[4] < QUARTER
+    assert -QUARTER_TURN <= ellipse[4] < QUARTER_TURN
 
 
 @pytest.mark.parametrize("diagonal, name", [
     (0, None), (0.39, None), (0.40, "Pedestrian"), (1.71, "Pedestrian"), (1.719, "Pedestrian"),
     (1.72, "Cyclist"), (2.99, "Cyclist"), (2.999, "Cyclist"), (3.00, "Car"), (6.40, "Car"),
     (6.41, None), (np.nan, None)])
-def test_classes_by_diagonal_at_the_borders(diagonal, name):
+def test_class_by_diagonal_at_the_limits(diagonal, name):
     boxes = np.array([[0, 0, 0, diagonal, 0, 9, 1], [0, 0, 0, 0, diagonal, 9, 1]])
     expected = -1 if name is None else CLASSES.index(name)
     for same in (boxes, boxes.astype(np.float32)):
-        ids = class_by_diagonal(same)
+        ids = classify_by_diagonal(same)
         assert ids.dtype == np.int32 and ids.tolist() == [expected] * 2
 
 
-def test_the_diagonal_is_that_of_length_and_width_and_no_box_has_no_class():
+def test_class_by_diagonal_uses_length_and_width():
     boxes = np.array([[0, 0, 0, 2.5, 1.8, 1.5, 1], [0, 0, 0, 1.7, 0.6, 1.7, 0]])
-    assert class_by_diagonal(boxes).tolist() == [CLASSES.index("Car"), CLASSES.index("Cyclist")]
-    assert class_by_diagonal(np.zeros((0, 7))).shape == (0,)
+    assert classify_by_diagonal(boxes).tolist() == [CLASSES.index("Car"), CLASSES.index("Cyclist")]
+    assert classify_by_diagonal(np.zeros((0, 7))).shape == (0,)
 
 
 @needs_data
-def test_most_boxes_of_real_cars_lie_along_the_cars():
+def test_boxes_of_real_cars_have_the_yaw_of_the_cars():
     errors = {"min_area": [], "l_shape": []}
     for frame in open_recording(DATA / "kitti_object"):
         xyz = frame.load().xyz
         for car in frame.truth().of_class(CLASSES.index("Car")):
             inside = xyz[points_in_box(xyz, car)]
             for shape, found in errors.items() if len(inside) >= 30 else ():
-                yaw = one(oriented_boxes, inside, shape)[6]
+                yaw = apply_to_one(fit_boxes, inside, shape)[6]
                 found.append(np.degrees(angle_between(yaw, car[6], np.pi / 2)))
     assert len(errors["l_shape"]) > 100
     assert np.median(errors["l_shape"]) < 1 and np.percentile(errors["l_shape"], 90) < 6

@@ -10,8 +10,8 @@ import torch
 from detection_samples import eager, frame, lively, random_detector, same, tiny
 
 from lidar_perception.clustering.cluster import cluster
-from lidar_perception.clustering.density import density
-from lidar_perception.clustering.shapes import class_by_diagonal, ellipses, oriented_boxes
+from lidar_perception.clustering.density import measure_density
+from lidar_perception.clustering.shapes import classify_by_diagonal, fit_boxes, fit_ellipses
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointpillars import detector as detector_module
 from lidar_perception.detectors.pointpillars.config import VERSIONS, network_config
@@ -45,7 +45,7 @@ def test_columns_that_are_given_say_the_same_as_those_that_are_computed(version)
     flat[indices] = segment_ground(seen, EXPERT_GROUND)
     ids = np.zeros(len(scan), np.uint32)
     obstacles = indices[~flat[indices]]
-    ids[obstacles] = cluster(scan.xyz[obstacles], EXPERT_CLUSTERING, density(seen.xyz))
+    ids[obstacles] = cluster(scan.xyz[obstacles], EXPERT_CLUSTERING, measure_density(seen.xyz))
     ids[ids > 0] *= 3  # whatever the numbers
     assert flat.any() and ids.max() >= 6
     computed = detector(scan)
@@ -84,13 +84,13 @@ def test_the_map_is_that_of_a_plain_loop_over_cells():
     spread = np.linspace(0.02, 3, 25)[:, None, None]
     xyz = (spots[:, None] + rng.normal(size=(25, 40, 3)) * spread * 0.5).reshape(-1, 3)
     xyz, ids = xyz.astype(np.float32), np.repeat(np.arange(25), 40).astype(np.int32)  # 0 is none
-    kinds = class_by_diagonal(oriented_boxes(xyz, ids, "min_area"))
+    kinds = classify_by_diagonal(fit_boxes(xyz, ids, "min_area"))
     assert {*kinds} == {-1, *(CLASSES.index(n) for n in MAP_CLASSES)}
     expected = np.zeros((3, *config.grid), np.uint8)
     y, x = np.meshgrid(*(low + (np.arange(n) + 0.5) * 0.16
                          for low, n in zip((config.low[1], config.low[0]), config.grid)),
                        indexing="ij")
-    for kind, (cx, cy, a, b, yaw) in zip(kinds, ellipses(xyz, ids).astype(float)):
+    for kind, (cx, cy, a, b, yaw) in zip(kinds, fit_ellipses(xyz, ids).astype(float)):
         if kind < 0:
             continue
         u = np.cos(yaw) * (x - cx) + np.sin(yaw) * (y - cy)

@@ -14,7 +14,7 @@ from scipy.special import logit
 from lidar_perception.candidates.boxes import snap_to_ground
 from lidar_perception.candidates.confidence import confidence, shape_features
 from lidar_perception.candidates.configurations import BEST
-from lidar_perception.clustering.shapes import oriented_boxes
+from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.detectors.pointnet.clusters import points_of
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointnet.rescoring import class_probabilities, known
@@ -39,7 +39,7 @@ def silhouette_at(boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray,
     """(K,) float64: the greatest confidence that a cluster at boxes (K, 7) is a pedestrian, 0 where
     there is none that may be. xyz (N, 3): what is not ground, with cluster_ids (N,), 1..J for
     people; ground (G, 3): the rest."""
-    found = snap_to_ground(oriented_boxes(xyz, cluster_ids, BEST.boxes.shape), fit_plane(ground))
+    found = snap_to_ground(fit_boxes(xyz, cluster_ids, BEST.boxes.shape), fit_plane(ground))
     chosen = np.flatnonzero((found[:, 5] >= HEIGHTS[0]) & (found[:, 5] <= HEIGHTS[1])
                             & (found[:, 3:5].max(axis=1, initial=0.0) <= LENGTH))
     near = centre_distances(boxes, found[chosen]) <= SAME_PLACE

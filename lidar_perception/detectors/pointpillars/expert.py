@@ -14,7 +14,7 @@ from numba import njit
 from lidar_perception.classes import TABLE
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.params import ClusteringParams
-from lidar_perception.clustering.shapes import class_by_diagonal, ellipses, oriented_boxes
+from lidar_perception.clustering.shapes import classify_by_diagonal, fit_boxes, fit_ellipses
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.detectors.view import levelled_ground
@@ -89,9 +89,9 @@ def draw_clusters(xyz: np.ndarray, cluster_ids: np.ndarray, config: NetworkConfi
     rectangle, and drawn as filled ellipses into the channel of its kind (MAP_KINDS): the
     cells whose middle lies in the ellipse, and the one that holds its centre.
     """
-    channels = CHANNELS[class_by_diagonal(oriented_boxes(xyz, cluster_ids, "min_area"))]
+    channels = CHANNELS[classify_by_diagonal(fit_boxes(xyz, cluster_ids, "min_area"))]
     image = np.zeros((len(MAP_KINDS), *config.grid), np.uint8)
-    _fill_ellipses(image, ellipses(xyz, cluster_ids), channels, config.low[0], config.low[1],
+    _fill_ellipses(image, fit_ellipses(xyz, cluster_ids), channels, config.low[0], config.low[1],
                    config.cell)
     return image
 

@@ -1,35 +1,40 @@
-"""DBSCAN cluster by cluster: from each core point to all that are within eps of those found."""
+"""DBSCAN cluster by cluster: each grows from a core point to all points within eps."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from lidar_perception.clustering.cells import cells_of, crowded
+from lidar_perception.clustering.cells import find_core_points, sort_into_cells
 
-# Points around a point, in the mean, beyond which going by cells is faster.
-LIMIT = 500
+# Mean number of points around a point above which DBSCAN by cells is faster.
+MAX_MEAN_NEIGHBOURS = 500
 
 
 def dbscan_by_growing(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray | None:
-    """(N,) int32 labels of points (N, 3) float32, as dbscan.dbscan; None if they are too dense.
-    No pairs are stored: memory grows with the number of points only."""
-    cells = cells_of(xyz, eps)
-    if np.diff(cells.start) @ cells.size > LIMIT * len(xyz):
+    """Cluster points (N, 3) float32, N > 0; return (N,) int32 labels as dbscan.dbscan does.
+
+    Return None for points that are too dense for this method. No pairs are stored: memory grows
+    with the number of points only.
+    """
+    cells = sort_into_cells(xyz, eps)
+    if np.diff(cells.start) @ cells.size > MAX_MEAN_NEIGHBOURS * len(xyz):
         return None
-    core = crowded(cells, np.full(len(xyz), eps * eps), float(min_samples), np.inf)[0]
+    core = find_core_points(cells, np.full(len(xyz), eps * eps), float(min_samples), np.inf)[0]
     labels = np.empty(len(xyz), np.int32)
-    labels[cells.order] = _grow(cells, np.ascontiguousarray(cells.xyz.T), core, eps * eps)
+    labels[cells.order] = _grow_clusters(cells, np.ascontiguousarray(cells.xyz.T), core, eps * eps)
     return labels
 
 
 @njit(cache=True, nogil=True)
-def _grow(cells, points, core, eps2):
-    """(N,) labels in the order of the cells. Clusters start at core points in the order of the
-    input, so that they are numbered by their first one, and a border point has the first to come.
+def _grow_clusters(cells, points, core, eps2):
+    """Return (N,) labels in the order of the cells.
 
-    items are the points of each cell: core points without a cluster up to new[a], others without
-    one from free[a] on, and between them those that have one.
+    Clusters start at core points in the order of the input. They are therefore numbered by their
+    first core point, and a border point joins the first cluster that reaches it.
+
+    items holds the points of each cell in three parts: core points without a cluster (up to
+    new[a]), points with a cluster, and other points without a cluster (from free[a] on).
     """
     n, start = len(points), cells.start
     cell, items, place = np.empty(n, np.int32), np.arange(n), np.empty(n, np.int64)

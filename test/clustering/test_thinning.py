@@ -1,4 +1,4 @@
-"""Arrangements that make every exact method look at all pairs: their work has a bound too."""
+"""Clouds that make every exact method compare all pairs: their work is bounded too."""
 
 from __future__ import annotations
 
@@ -7,17 +7,19 @@ import pytest
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from lidar_perception.clustering import dense, thinned
+from lidar_perception.clustering import dbscan_cells, thinning
 from lidar_perception.clustering.dbscan import dbscan, distance_aware_dbscan
-from lidar_perception.clustering.euclidean import euclidean
+from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import DbscanParams, EuclideanParams
 
 REACH = 0.5
 
 
 def shell(n, gap, seed=0):
-    """Half of the points on one place at x = 15 m, the others on a half sphere around it, a share
-    `gap` of REACH out of reach, further out."""
+    """Return half of the points at x = 15 m and half on a hemisphere around them.
+
+    The hemisphere is farther from the sensor, and out of reach by a share `gap` of REACH.
+    """
     rng = np.random.default_rng(seed)
     normal = rng.normal(size=(n // 2, 3))
     normal[:, 0] = np.abs(normal[:, 0]) + 0.2
@@ -30,65 +32,65 @@ METHODS = {
     "dbscan": lambda xyz: dbscan(xyz, REACH, 5),
     "bands": lambda xyz: distance_aware_dbscan(xyz, DbscanParams(
         eps=(REACH,) * 3, min_samples=5, join_bands=True)),
-    "euclidean": lambda xyz: euclidean(xyz, EuclideanParams(threshold="fixed", distance=REACH,
-                                                            gamma=0.0), patience=-1),
+    "euclidean": lambda xyz: cluster_euclidean(
+        xyz, EuclideanParams(threshold="fixed", distance=REACH, gamma=0.0), max_distances=-1),
 }
 each_method = pytest.mark.parametrize("method", METHODS)
 
 
 @pytest.fixture
-def impatient(monkeypatch):
-    monkeypatch.setattr(thinned, "ENOUGH", 0)
-    monkeypatch.setattr(thinned, "PATIENCE", -1)
+def always_thin(monkeypatch):
+    monkeypatch.setattr(thinning, "MIN_DISTANCES", 0)
+    monkeypatch.setattr(thinning, "MAX_DISTANCES_PER_POINT", -1)
 
 
 @each_method
-def test_with_patience_a_hair_out_of_reach_is_another_cluster(method):
+def test_points_slightly_out_of_reach_are_separate_clusters(method):
     assert METHODS[method](shell(3000, 0.001)).max() == 2
     assert METHODS[method](shell(3000, -0.001)).max() == 1
 
 
 @each_method
 @pytest.mark.parametrize("seed", range(3))
-def test_without_patience_a_longer_reach_connects_no_less(method, seed, impatient):
-    """What it connects is between what the reach and the longer reach connect."""
+def test_thinning_connects_no_less_and_little_more(method, seed, always_thin):
+    """Thinned clusters lie between those of the reach and those of the longer reach."""
     rng = np.random.default_rng(seed)
     blobs = rng.uniform(-2.5, 2.5, (12, 3)) + [15, 0, 0]
     xyz = np.concatenate([blob + rng.normal(0, 0.05, (60, 3)) for blob in blobs])
     labels = METHODS[method](xyz.astype(np.float32))
     assert (labels > 0).all()
     distance = cdist(xyz, xyz)
-    least, most = (connected_components(distance <= REACH * longer)[1]
-                   for longer in (1.0, 1.0 + thinned.SLACK))
-    for sets, finer in ((labels, least), (most, labels)):
-        pairs = np.unique(np.column_stack([finer, sets]), axis=0)
+    finest, coarsest = (connected_components(distance <= REACH * factor)[1]
+                        for factor in (1.0, 1.0 + thinning.SLACK))
+    for coarser, finer in ((labels, finest), (coarsest, labels)):
+        pairs = np.unique(np.column_stack([finer, coarser]), axis=0)
         assert len(pairs) == len(np.unique(finer))
 
 
-def test_one_of_each_cube_stands_for_the_others():
+def test_one_point_represents_each_cube_and_kind():
     rng = np.random.default_rng(0)
     xyz, kind = rng.random((4000, 3)), rng.integers(0, 2, 4000)
     reach = rng.choice([0.3, 3.0], 4000)
-    kept, group = thinned.thinned(xyz, reach, kind)
+    kept, group = thinning.thin_points(xyz, reach, kind)
     assert len(kept) < 4000 and (group[kept] == np.arange(len(kept))).all()
     assert (kind[kept[group]] == kind).all() and (reach[kept[group]] == reach).all()
-    away = np.linalg.norm(xyz - xyz[kept[group]], axis=1)
-    assert (away <= thinned.SLACK / 2 * reach).all()
-    assert [len(x) for x in thinned.thinned(np.zeros((0, 3)), 1.0)] == [0, 0]
+    distance = np.linalg.norm(xyz - xyz[kept[group]], axis=1)
+    assert (distance <= thinning.SLACK / 2 * reach).all()
+    assert [len(x) for x in thinning.thin_points(np.zeros((0, 3)), 1.0)] == [0, 0]
 
 
 @pytest.mark.parametrize("gap", [1e-3, 1e-5])
-def test_the_work_of_joining_grows_no_faster_than_the_points(gap, monkeypatch):
-    """Counted in distances, exact and thinned together; all pairs would be 16 times as many."""
-    monkeypatch.setattr(thinned, "ENOUGH", 0)
-    monkeypatch.setattr(thinned, "PATIENCE", 50)
-    works, joined = [], dense._joined
+def test_work_of_joining_cells_grows_linearly(gap, monkeypatch):
+    """Count distances, exact and thinned; comparing all pairs would take 16 times as many."""
+    monkeypatch.setattr(thinning, "MIN_DISTANCES", 0)
+    monkeypatch.setattr(thinning, "MAX_DISTANCES_PER_POINT", 50)
+    works, join_cells = [], dbscan_cells._join_cells
 
-    def counted(*arguments):
-        parent, work = joined(*arguments)
+    def count_work(*arguments):
+        parent, work = join_cells(*arguments)
         works[-1] += work
         return parent, work
-    monkeypatch.setattr(dense, "_joined", counted)
+    monkeypatch.setattr(dbscan_cells, "_join_cells", count_work)
     for count in (20_000, 80_000):
         works.append(0)
         METHODS["dbscan"](shell(count, gap))

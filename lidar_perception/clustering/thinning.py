@@ -1,0 +1,48 @@
+"""Thinning of nearly coincident points, for clouds where comparing all pairs takes too long.
+
+No exact method finds the sets of points within reach of each other in O(n log n) in 3D (Gan and
+Tao, "DBSCAN Revisited", SIGMOD 2015). With half of a cloud at one place and the other half on a
+sphere around it, slightly out of reach, every exact method compares all pairs. Each search
+therefore has a limit. Beyond it, one point represents all points of a cube whose side is the reach
+divided by CUBES_PER_REACH, and the reach is longer by SLACK. Connected points stay connected;
+points that are farther apart than the reach by less than SLACK may be connected too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+CUBES_PER_REACH = 32
+# Share of the reach: both points of a pair may be a cube's diagonal from the one that is kept.
+SLACK = 2 * 3**0.5 / CUBES_PER_REACH
+MAX_DISTANCES_PER_POINT = 2_000
+MIN_DISTANCES = 2**30  # lower limit of a search's budget, about a second
+
+
+def max_exact_distances(count: int) -> float:
+    """Return how many distances an exact search of `count` points may compute."""
+    return float(max(MAX_DISTANCES_PER_POINT * count, MIN_DISTANCES))
+
+
+def thin_points(xyz: np.ndarray, reach: np.ndarray | float,
+                kind: np.ndarray | int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Keep one point per cube and kind.
+
+    Args:
+        xyz: (N, 3) points.
+        reach: (N,) or one for all; the cubes of a point are sized by its reach, rounded down to a
+            power of two.
+        kind: (N,) int; points of different kinds are never merged.
+
+    Returns:
+        kept (K,), the indices of the points kept, and group (N,), the one of them, 0..K-1, that
+        represents each point.
+    """
+    octave = np.floor(np.log2(np.broadcast_to(np.maximum(reach, 1e-6), len(xyz))))
+    cubes = np.floor(xyz / (2.0**octave / CUBES_PER_REACH)[:, None])
+    keys = np.column_stack([cubes, octave, np.broadcast_to(kind, len(xyz))])
+    order = np.lexsort(keys.T)
+    new = np.r_[True, (keys[order][1:] != keys[order][:-1]).any(axis=1)][:len(order)]
+    group = np.empty(len(xyz), np.int64)
+    group[order] = np.cumsum(new) - 1
+    return order[new], group
