@@ -14,8 +14,9 @@ from detection_samples import lively, random_detector, same, tiny
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.devices import CPU
+from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.detectors.pointpillars import sparse, sparse_kernels
+from lidar_perception.detectors.pointpillars import sparse
 from lidar_perception.detectors.pointpillars.config import network_config
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
 from lidar_perception.detectors.pointpillars.expert import NetworkInput
@@ -28,7 +29,7 @@ from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import InputError
 
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.skipif(
-    not sparse_kernels.LANES, reason="Numba compiles for a processor without AVX2")]
+    not LANES, reason="Numba compiles for a processor without AVX2")]
 
 TOLERANCE = 1e-4  # of features and logits, whose sizes are about 1 to 30
 WIDE = dict(low=(-12.8, -14.08, -3.0), high=(12.8, 14.08, 1.0))  # 176 x 160 pillars
@@ -187,7 +188,7 @@ def test_networks_that_torch_must_run(monkeypatch):
     assert TorchNetwork(network).sparse is None and TorchNetwork(network, engine="auto").sparse
     with pytest.raises(InputError, match="16 bits"):
         TorchNetwork(network, amp="bf16", engine="sparse")
-    monkeypatch.setattr(sparse_kernels, "LANES", 0)
+    monkeypatch.setattr(sparse, "LANES", 0)
     assert "AVX2" in sparse.unsupported(fused(network))
     assert TorchNetwork(network, engine="auto").sparse is None
 
@@ -259,16 +260,18 @@ def test_a_cloud_without_a_pillar_detects_nothing():
 KERNEL = """
 import numpy as np
 from lidar_perception.detectors.pointpillars import sparse_kernels as kernels
-assert kernels.LANES == 8
+from lidar_perception.detectors.matrix_kernel import BLOCK, LANES
+assert LANES == 8
 rng = np.random.default_rng(0)
 rows = rng.normal(size=(50, 12)).astype(np.float32)
 rows[0] = 0
 index = np.zeros((8, 9), np.int32)
 index[1:-1, 1:-1] = rng.integers(0, 50, (6, 7))
-weights = rng.normal(size=(2, 9, 12, kernels.BLOCK)).astype(np.float32)
+weights = rng.normal(size=(2, 9, 12, BLOCK)).astype(np.float32)
 cells = np.flatnonzero(rng.random(42) < 0.7).astype(np.int32)
-sums = np.ones((len(cells), 2 * kernels.BLOCK), np.float32)
-kernels.convolve(index, rows, cells, 7, 1, weights, sums, np.float32(-2.0), 0, len(cells))
+bias = np.ones(2 * BLOCK, np.float32)
+sums = np.empty((len(cells), 2 * BLOCK), np.float32)
+kernels.convolve(index, rows, cells, 7, 1, weights, bias, sums, np.float32(-2.0), 0, len(cells))
 for cell, found in zip(cells, sums):
     y, x = divmod(cell, 7)
     read = rows[index[y:y + 3, x:x + 3].ravel()]
@@ -278,7 +281,7 @@ for cell, found in zip(cells, sums):
 
 
 def test_kernel_of_avx2_on_a_wider_processor():
-    if sparse_kernels.LANES != 16:
+    if LANES != 16:
         pytest.skip("the other tests have run it")
     features = "+sse,+sse2,+sse3,+ssse3,+sse4.1,+sse4.2,+popcnt,+avx,+avx2,+fma,+bmi,+bmi2,+lzcnt"
     environment = {**os.environ, "NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": features}

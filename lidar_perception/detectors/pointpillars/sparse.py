@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidar_perception.detectors.matrix_kernel import LANES, padded, padded_bias
 from lidar_perception.detectors.pointpillars import sparse_kernels as kernels
 from lidar_perception.detectors.pointpillars.network import FpnNeck, PointPillars, Prediction
 from lidar_perception.detectors.pointpillars.pillars import Pillars
@@ -28,8 +29,6 @@ from lidar_perception.detectors.pointpillars.sparse_layers import (
     Layer,
     dilated,
     make_layers,
-    padded,
-    padded_bias,
     shrunk,
 )
 
@@ -54,7 +53,7 @@ class Map(NamedTuple):
 def unsupported(network: PointPillars) -> str | None:
     """Return why SparseNetwork cannot run a network on this machine, None where it can."""
     config = network.pillar_net.config
-    if not kernels.LANES:
+    if not LANES:
         return "this processor has no AVX2"
     if not config.remove_ground:
         return f"{config.version} also reads the ground, which occupies most cells"
@@ -71,6 +70,7 @@ class SparseNetwork:
 
     def __init__(self, network: PointPillars):
         self.head, self.has_map = network.head, network.map_net is not None
+        self.first_block = 1 if network.map_net is None else 2 + len(network.map_net)
         self.layers = make_layers(network)
         linear, config = network.pillar_net.linear, network.pillar_net.config
         points, offsets = config.point_columns, config.offset_columns
@@ -80,7 +80,8 @@ class SparseNetwork:
         scaled = (linear.weight.detach() * scales)[:, order].T.numpy()  # points, then offsets
         self.pillar_weights = np.zeros((len(scaled), padded(linear.out_features)), np.float32)
         self.pillar_weights[:, :linear.out_features] = scaled
-        self.pillar_bias = padded_bias(linear.bias, self.pillar_weights.shape[1])
+        bias = None if linear.bias is None else linear.bias.detach().numpy()
+        self.pillar_bias = padded_bias(bias, self.pillar_weights.shape[1])
         self._empty: dict[Grid, list[Map]] = {}
 
     def __call__(self, pillars: Pillars, maps: Tensor | None) -> Prediction:
@@ -131,20 +132,23 @@ class SparseNetwork:
 
     def _chosen(self, occupied: list[np.ndarray], reach: int | None) -> list[np.ndarray]:
         """Return the cells (H, W) bool that each layer has to compute."""
-        reached = list(occupied)
+        masks = list(occupied)
         for layer in self.layers:
-            reached.append(layer.reached(reached))
-        needed = [np.zeros_like(mask) for mask in reached]
+            masks.append(layer.reached(masks))
         if reach is None:
-            needed[-1][:] = True
+            masks[-1] = np.ones_like(masks[-1])
         else:
-            scale = len(occupied[0]) // len(needed[-1])
-            needed[-1] = dilated(shrunk(occupied[0], scale), reach)
-        reached[-1] = needed[-1]
-        for i in range(len(self.layers) - 1, -1, -1):
-            own = len(occupied) + i
-            self.layers[i].require(needed[own], needed[:own])
-        return [a & b for a, b in zip(reached, needed)][len(occupied):]
+            scale = len(occupied[0]) // len(masks[-1])
+            masks[-1] = dilated(shrunk(occupied[0], scale), reach)
+        # The layers before the blocks compute a few cells only, fewer than it takes to find out
+        # which of them are needed.
+        needed = [None if i < self.first_block else np.zeros_like(mask)
+                  for i, mask in enumerate(masks)]
+        needed[-1] = masks[-1]
+        for i in range(len(masks) - 1, self.first_block - 1, -1):
+            self.layers[i - len(occupied)].require(needed[i], needed)
+            masks[i] &= needed[i]
+        return masks[len(occupied):]
 
     def _run(self, inputs: list[Map], chosen: Sequence[np.ndarray],
              empty: Sequence[Map]) -> list[Map]:
@@ -206,17 +210,19 @@ def _computed(layer: Layer, maps: list[Map], chosen: np.ndarray, background: Map
     rows = np.empty((first + len(cells), len(layer.bias)), np.float32)
     rows[:first] = background.rows
     sums, width = rows[first:], chosen.shape[1]
-    sums[:] = layer.bias
 
     def compute(begin: int, end: int) -> None:
+        bias = layer.bias
         if layer.coarse is not None:
-            kernels.upsample(*maps[layer.coarse], cells, width, layer.scale, sums, begin, end)
-        for i, term in enumerate(layer.terms, start=1):
-            floor = layer.floor if i == len(layer.terms) else -np.inf
-            kernels.convolve(*maps[term.source], cells, width, term.stride, term.weights, sums,
+            kernels.upsample(*maps[layer.coarse], cells, width, layer.scale, bias, sums, begin, end)
+            bias = bias[:0]
+        for i, (source, weights) in enumerate(zip(layer.sources, layer.weights), start=1):
+            floor = layer.floor if i == len(layer.sources) else -np.inf
+            kernels.convolve(*maps[source], cells, width, layer.stride, weights, bias, sums,
                              np.float32(floor), begin, end)
+            bias = bias[:0]
 
-    _in_parts(compute, len(cells), sum(term.weights.size for term in layer.terms))
+    _in_parts(compute, len(cells), sum(weights.size for weights in layer.weights))
     return Map(index, rows)
 
 

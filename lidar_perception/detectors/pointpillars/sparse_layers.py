@@ -9,74 +9,72 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from torch import Tensor, nn
+from torch import nn
 
-from lidar_perception.detectors.pointpillars import sparse_kernels as kernels
+from lidar_perception.detectors.matrix_kernel import BLOCK, packed, padded_bias
 from lidar_perception.detectors.pointpillars.network import FpnNeck, PointPillars
 
 Grid = tuple[int, int]
 
 
-class Term(NamedTuple):
-    """A convolution of map number `source`; weights (blocks, taps, channels, BLOCK) float32 as in
-    kernels.convolve."""
-
-    source: int
-    weights: np.ndarray
-    stride: int
-
-    @property
-    def margin(self) -> int:
-        """Number of cells that it reads beyond the one in the middle."""
-        return 1 if self.weights.shape[1] == 9 else 0
-
-
 @dataclass(frozen=True)
 class Layer:
-    """The sum of a bias (C,), of convolutions, and of map number `coarse` enlarged `scale` times;
-    a sum below floor becomes floor."""
+    """A convolution of the maps number `sources`, side by side, and map number `coarse` enlarged
+    `scale` times, added.
 
+    weights: For each source, (blocks, taps, channels, BLOCK) float32 as in kernels.convolve; 9 taps
+        of a 3 x 3 or 1 of a 1 x 1 convolution.
+    bias: (C,) float32.
+    floor: A sum below it becomes floor.
+    """
+
+    sources: tuple[int, ...]
+    weights: tuple[np.ndarray, ...]
     bias: np.ndarray
-    terms: tuple[Term, ...]
+    stride: int = 1
     floor: float = -math.inf
     coarse: int | None = None
     scale: int = 1
 
+    @property
+    def window(self) -> int:
+        """Number of cells that the convolution reads beyond the one in the middle."""
+        return 1 if self.weights[0].shape[1] == 9 else 0
+
     def grid(self, grids: Sequence[Grid]) -> Grid:
         """Return (H, W) of its map, from those of the maps before it."""
-        height, width = grids[self.terms[0].source]
-        return height // self.terms[0].stride, width // self.terms[0].stride
+        height, width = grids[self.sources[0]]
+        return height // self.stride, width // self.stride
 
     def reached(self, occupied: Sequence[np.ndarray]) -> np.ndarray:
         """Return (H, W) bool, True where its value depends on an occupied cell of the maps before
         it."""
-        masks = [dilated(occupied[term.source], term.margin)[::term.stride, ::term.stride]
-                 for term in self.terms]
-        if self.coarse is not None:
-            masks.append(dilated(enlarged(occupied[self.coarse], self.scale),
-                                 (self.scale + 1) // 2))
-        return np.logical_or.reduce(masks)
+        read = np.logical_or.reduce([occupied[source] for source in self.sources])
+        mask = dilated(read, self.window)[::self.stride, ::self.stride]
+        if self.coarse is None:
+            return mask
+        return mask | dilated(enlarged(occupied[self.coarse], self.scale), (self.scale + 1) // 2)
 
-    def require(self, needed: np.ndarray, sources: Sequence[np.ndarray]) -> None:
-        """Set in sources, one mask for each map before it, the cells that its cells needed (H, W)
-        are computed from."""
-        for term in self.terms:
-            read = np.zeros_like(sources[term.source])
-            read[::term.stride, ::term.stride] = needed
-            sources[term.source][:] |= dilated(read, term.margin)
-        if self.coarse is not None:
-            sources[self.coarse][:] |= dilated(shrunk(needed, self.scale), 1)
+    def require(self, needed: np.ndarray, masks: Sequence[np.ndarray | None]) -> None:
+        """Set the cells from which its cells needed (H, W) are computed, in the masks of the maps
+        before it. None: a map of which everything is computed."""
+        for source in self.sources:
+            if (mask := masks[source]) is not None:
+                read = np.zeros_like(mask)
+                read[::self.stride, ::self.stride] = needed
+                mask |= dilated(read, self.window)
+        if self.coarse is not None and (mask := masks[self.coarse]) is not None:
+            mask |= dilated(shrunk(needed, self.scale), 1)
 
     def margin(self, margins: Sequence[int]) -> int:
         """Return the number of cells along each border in which its map of an empty cloud may
         differ from the value inside; margins: those of the maps before it."""
-        own = [-(-margins[term.source] // term.stride) + term.margin for term in self.terms]
-        if self.coarse is not None:
-            own.append((margins[self.coarse] + 1) * self.scale)
-        return max(own)
+        own = max(-(-margins[source] // self.stride) for source in self.sources) + self.window
+        if self.coarse is None:
+            return own
+        return max(own, (margins[self.coarse] + 1) * self.scale)
 
 
 def dilated(mask: np.ndarray, cells: int) -> np.ndarray:
@@ -114,11 +112,11 @@ def make_layers(network: PointPillars) -> list[Layer]:
         assert isinstance(convolution, nn.Conv2d)
         widths = [network.pillar_net.linear.out_features if source == 0 else 3
                   if source < inputs else outputs[source - inputs] for source in sources]
-        parts = convolution.weight.detach().split(widths, dim=1)
-        terms = tuple(Term(source, packed(part), convolution.stride[0])
-                      for source, part in zip(sources, parts))
-        bias = padded_bias(convolution.bias, terms[0].weights.shape[0] * kernels.BLOCK)
-        layers.append(Layer(bias, terms, 0.0 if relu else -math.inf, coarse, scale))
+        parts = convolution.weight.detach().flatten(2).split(widths, dim=1)
+        weights = tuple(packed(part.numpy()) for part in parts)
+        own = None if convolution.bias is None else convolution.bias.detach().numpy()
+        layers.append(Layer(tuple(sources), weights, padded_bias(own, len(weights[0]) * BLOCK),
+                            convolution.stride[0], 0.0 if relu else -math.inf, coarse, scale))
         outputs.append(convolution.out_channels)
         return inputs + len(layers) - 1
 
@@ -143,27 +141,3 @@ def make_layers(network: PointPillars) -> list[Layer]:
     assert joined is not None
     add(network.head.scores, [add(next(neck.out.children()), [joined])], relu=False)
     return layers
-
-
-def packed(weight: Tensor) -> np.ndarray:
-    """Return weights (O, I, k, k) of a convolution as in kernels.convolve, filled up with zeros."""
-    out, channels, *window = weight.shape
-    taps = math.prod(window)
-    blocks = -(-out // kernels.BLOCK)
-    filled = np.zeros((blocks * kernels.BLOCK, padded(channels), taps), np.float32)
-    filled[:out, :channels] = weight.reshape(out, channels, taps).numpy()
-    return np.ascontiguousarray(
-        filled.reshape(blocks, kernels.BLOCK, -1, taps).transpose(0, 3, 2, 1))
-
-
-def padded(channels: int) -> int:
-    """Return the number of channels that a row of an input map has."""
-    return -(-channels // kernels.UNROLL) * kernels.UNROLL
-
-
-def padded_bias(bias: Tensor | None, width: int) -> np.ndarray:
-    """Return a bias (O,) or None as (width,) float32, filled up with zeros."""
-    filled = np.zeros(width, np.float32)
-    if bias is not None:
-        filled[:len(bias)] = bias.detach().numpy()
-    return filled
