@@ -16,7 +16,7 @@ import numpy as np
 from benchmark import clustering, ground, peers
 from benchmark.busy import measure_busy
 from benchmark.candidates import compare_candidates, print_comparison
-from benchmark.detection import measure_detection, print_detection
+from benchmark.detection import measure_detection, measure_engines, print_detection
 from benchmark.graph import measure_graph, print_graph
 from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import print_ground, print_measured, print_planes
@@ -87,6 +87,8 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     if scans:
         content["detection"] = measure_detection(scans, repeat)
         print_detection(content["detection"])
+        content["engines"] = measure_engines(scans, repeat)
+        print_measured(content["engines"])
         content["pointnet"] = measure_pointnet(scans, repeat)
         print_pointnet(content["pointnet"])
         content["busy"] = measure_busy(scans, repeat)

@@ -1,17 +1,24 @@
-"""Every version and size of EG-PointPillars on this machine's device: the time of each step."""
+"""Every version and size of EG-PointPillars on this machine's device: the time of each step; and
+the sparse engine compared with torch on the CPU."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from functools import partial
+from time import process_time
 from typing import Any
 
 import numpy as np
 import torch
 from rich.table import Table
 
-from benchmark.timing import evenly_chosen
+from benchmark.rows import against, measured
+from benchmark.timing import Clock, evenly_chosen
 from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.contract import FUSED, Found
 from lidar_perception.detectors.devices import chosen_device
+from lidar_perception.detectors.open import POINTPILLARS, open_detector
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS, network_config
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
 from lidar_perception.detectors.pointpillars.network import make_network
@@ -28,9 +35,9 @@ FEW = 3           # scans for full on a CPU, where a frame takes half a second
 
 def measure_detection(scans: list[LidarFrame], repeat: int,
                       sizes: Sequence[str] = tuple(SIZES)) -> dict:
-    """Medians over whole scans, each `repeat` times, versions taken in turn. Weights are random:
-    time depends on them only by what passes the thresholds, which are set to let CANDIDATES
-    anchors through."""
+    """Medians over whole scans, each `repeat` times, versions taken in turn, all in torch. Weights
+    are random: time depends on them only by what passes the thresholds, which are set to let
+    CANDIDATES anchors through."""
     device = chosen_device()
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
     content: dict[str, Any] = {"device": name, "threads": torch.get_num_threads(), "sizes": {}}
@@ -100,17 +107,49 @@ def _random_detector(version: str, size: str, device: torch.device,
 
 def print_detection(content: dict) -> None:
     """A table for each size, with each step's share."""
-    for size, measured in content["sizes"].items():
-        table = Table(title=f"EG-PointPillars {size}, ms a frame ({measured['frames']} scans, "
-                            f"{measured['points']:.0f} points) on {content['device']}, "
+    for size, figures in content["sizes"].items():
+        table = Table(title=f"EG-PointPillars {size}, ms a frame ({figures['frames']} scans, "
+                            f"{figures['points']:.0f} points) on {content['device']}, "
                             f"{content['threads']} CPU threads, random weights")
         for name in ("version", *STEPS, "total", "to v0", "paper's"):
             table.add_column(name, justify="left" if name == "version" else "right")
-        for version, found in measured["versions"].items():
+        for version, found in figures["versions"].items():
             table.add_row(version, *(f"{found['ms'][step]:.1f} ({100 * found['share'][step]:.0f} %)"
                                      for step in STEPS), f"{found['total_ms']:.1f}",
                           f"{found['to_v0']:.2f}", f"{found['paper_to_v0']:.2f}")
         console.print(table)
-        ratio = measured["versions"]["v4"]["to_v0"]
+        ratio = figures["versions"]["v4"]["to_v0"]
         console.print(f"v4 takes {ratio:.2f} of the time of v0, target < {TARGET}: "
                       + ("met" if ratio < TARGET else "not met"))
+
+
+def measure_engines(scans: list[LidarFrame], repeat: int,
+                    detectors: Sequence[str] = (POINTPILLARS, FUSED)) -> dict:
+    """Compare the engines torch and sparse of PointPillars with the weights of the package: median
+    CPU time of one thread, in turns. `same` counts scans with the same detections."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    rows = []
+    for weights in detectors:
+        for range_ in "ahead", "around":
+            engines = {name: open_detector(weights, "cpu", range=range_, settings={
+                f"{weights}.threads": 1, f"{weights}.engine": engine})
+                for name, engine in (("torch", "torch"), ("ours", "sparse"))}
+            name, same = f"{weights} {range_}, engine torch", 0
+            clock = Clock(repeat, {}, process_time)
+            for scan in track(scans, name, len(scans)):
+                found = clock.time({each: partial(detector, scan)
+                                    for each, detector in engines.items()})
+                same += _same(found["torch"], found["ours"])
+            ms = clock.medians()
+            rows.append(against(name, {name: ms["torch"], "ours": ms["ours"]}, same=same))
+    torch.set_num_threads(threads)
+    title = f"Sparse engine, CPU ms of one thread at a load of {os.getloadavg()[0]:.1f}"
+    return measured(title, len(scans), np.median([len(scan) for scan in scans]), rows)
+
+
+def _same(a: Found, b: Found) -> bool:
+    a_, b_ = a.detections, b.detections
+    return bool(np.array_equal(a_.class_ids, b_.class_ids)
+                and np.allclose(a_.boxes, b_.boxes, rtol=0, atol=1e-4)
+                and np.allclose(a_.scores, b_.scores, rtol=0, atol=1e-5))

@@ -14,16 +14,17 @@ Calls = dict[str, Callable[[], Any]]
 SLOW_REPEAT = 2  # runs a frame at most beside a peer that takes seconds
 
 
-def interleaved(calls: Calls, repeat: int) -> tuple[dict[str, float], dict[str, Any]]:
+def interleaved(calls: Calls, repeat: int, clock: Callable[[], float] = perf_counter
+                ) -> tuple[dict[str, float], dict[str, Any]]:
     """Median ms of each call over `repeat` rounds, and what it gave in the last one. A round calls
-    each once, in the order of the dict."""
+    each once, in the order of the dict. clock: of seconds; time.process_time counts CPU time."""
     ms: dict[str, list[float]] = {name: [] for name in calls}
     results: dict[str, Any] = {}
     for _ in range(repeat):
         for name, call in calls.items():
-            start = perf_counter()
+            start = clock()
             results[name] = call()
-            ms[name].append(1e3 * (perf_counter() - start))
+            ms[name].append(1e3 * (clock() - start))
     return {name: float(np.median(v)) for name, v in ms.items()}, results
 
 
@@ -31,14 +32,15 @@ class Clock:
     """Gathers times over frames. The calls of warm are made once before, untimed; a thin cloud is
     enough for them."""
 
-    def __init__(self, repeat: int, warm: Calls) -> None:
-        self.repeat = repeat
+    def __init__(self, repeat: int, warm: Calls,
+                 clock: Callable[[], float] = perf_counter) -> None:
+        self.repeat, self.clock = repeat, clock
         self.ms: dict[str, list[float]] = {}
         interleaved(warm, 1)
 
     def time(self, calls: Calls) -> dict[str, Any]:
         """Times one frame; gives what each call gave."""
-        ms, results = interleaved(calls, self.repeat)
+        ms, results = interleaved(calls, self.repeat, self.clock)
         for name, value in ms.items():
             self.ms.setdefault(name, []).append(value)
         return results

@@ -14,7 +14,7 @@ from samples import object_folder, scene, walker_label
 
 from benchmark import busy, ground, peers, plain_euclidean
 from benchmark.clustering import dbscan_times, measure_dbscan, same_clusters
-from benchmark.detection import measure_detection, print_detection
+from benchmark.detection import measure_detection, measure_engines, print_detection
 from benchmark.plain_pointnet2 import ball, farthest
 from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import print_ground, print_measured, row, target_text, value_text
@@ -136,6 +136,14 @@ def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsy
     # What a version has no use for is not part of its time.
     assert ran == {"v0": (False, False), "v1": (True, False),
                    **dict.fromkeys(("v2", "v3", "v4"), (True, True))}
+
+
+def test_engines_are_timed_and_compared(one_thread, capsys):
+    points = scene()
+    content = measure_engines([LidarFrame(points[:, :3], points[:, 3])], 1, ("pointpillars",))
+    print_measured(json.loads(json.dumps(content)))
+    assert "around, engine torch" in " ".join(capsys.readouterr().out.split())
+    assert [(row["same"], row["value"] > 0) for row in content["rows"]] == [(1, True)] * 2
 
 
 @pytest.mark.no_cover

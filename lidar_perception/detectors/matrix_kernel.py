@@ -137,7 +137,7 @@ def packed(weights: np.ndarray) -> np.ndarray:
 
 
 def padded(channels: int) -> int:
-    """Return the number of values that a row needs to be read as so many channels."""
+    """Return the number of values that a row of `channels` values needs: a multiple of UNROLL."""
     return -(-channels // UNROLL) * UNROLL
 
 

@@ -145,9 +145,10 @@ class SparseNetwork:
         needed = [None if i < self.first_block else np.zeros_like(mask)
                   for i, mask in enumerate(masks)]
         needed[-1] = masks[-1]
-        for i in range(len(masks) - 1, self.first_block - 1, -1):
-            self.layers[i - len(occupied)].require(needed[i], needed)
-            masks[i] &= needed[i]
+        for i, mask in reversed([*enumerate(needed)]):
+            if mask is not None:
+                self.layers[i - len(occupied)].require(mask, needed)
+                masks[i] &= mask
         return masks[len(occupied):]
 
     def _run(self, inputs: list[Map], chosen: Sequence[np.ndarray],
