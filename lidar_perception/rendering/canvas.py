@@ -87,30 +87,33 @@ class Canvas:
             return
         tints = np.broadcast_to(np.asarray(colors, np.float32), (len(segments), 3))[kept]
         opaque = np.broadcast_to(np.asarray(alpha, np.float32), len(segments))[kept]
-        along = np.abs(end - start)
-        steep = along[:, 1] > along[:, 0]
+        way = end - start
+        steep = np.abs(way[:, 1]) > np.abs(way[:, 0])
         # One sample for each column, or row of a steep line, and several pixels across it.
-        count = np.ceil(along.max(axis=1)).astype(np.int64) + 1
+        main = np.where(steep[:, None], np.stack([start[:, 1], end[:, 1]], axis=1),
+                        np.stack([start[:, 0], end[:, 0]], axis=1))
+        cells = np.floor(main).astype(np.int64)
+        count = np.abs(cells[:, 1] - cells[:, 0]) + 1
         owner = np.repeat(np.arange(len(kept)), count)
         step = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
-        share = step / np.maximum(count - 1, 1)[owner]
-        at = start[owner] + share[:, None] * (end - start)[owner]
+        cell = cells.min(axis=1)[owner] + step
+        share = (cell + 0.5 - main[owner, 0]) / np.where(way.any(axis=1), main[:, 1] - main[:, 0],
+                                                         1.0)[owner]
+        share = np.clip(share, 0.0, 1.0)[:, None]
+        at = start[owner] + share * way[owner]
+        length = np.maximum(np.hypot(*way.T), 1e-9)
         if dashed:
             first = np.linalg.norm(start - segments[kept, 0], axis=1)
-            way = first[owner] + share * np.linalg.norm(end - start, axis=1)[owner]
-            drawn = way % (DASH + GAP) < DASH
-            at, owner = at[drawn], owner[drawn]
-        length = np.maximum(np.hypot(*along.T), 1e-9)
-        cosine = (along.max(axis=1) / length)[owner]  # of the angle to the axis of the samples
+            drawn = (first[owner] + share[:, 0] * length[owner]) % (DASH + GAP) < DASH
+            at, owner, cell = at[drawn], owner[drawn], cell[drawn]
+        cosine = (np.abs(way).max(axis=1) / length)[owner]  # of the angle to the axis of the cells
         reach = int(np.ceil(width)) + 1
-        shift = np.arange(-reach, reach + 1)
         across = np.where(steep[owner], at[:, 0], at[:, 1])
-        cell = np.floor(across)[:, None] + shift
-        cover = np.clip(width / 2 + 0.5 - np.abs(cell + 0.5 - across[:, None]) * cosine[:, None],
+        beside = np.floor(across)[:, None] + np.arange(-reach, reach + 1)
+        cover = np.clip(width / 2 + 0.5 - np.abs(beside + 0.5 - across[:, None]) * cosine[:, None],
                         0.0, 1.0)
-        main = np.floor(np.where(steep[owner], at[:, 1], at[:, 0]))[:, None]
-        column = np.where(steep[owner, None], cell, main)
-        row = np.where(steep[owner, None], main, cell)
+        column = np.where(steep[owner, None], beside, cell[:, None])
+        row = np.where(steep[owner, None], cell[:, None], beside)
         self._blend(column, row, cover * opaque[owner, None], tints[owner])
 
     def _blend(self, column: np.ndarray, row: np.ndarray, cover: np.ndarray,

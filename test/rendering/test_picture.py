@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidar_perception.rendering.colors import LABEL, by_cluster, by_height, class_color
@@ -46,8 +46,8 @@ def test_boxes_are_drawn_in_both_views_in_the_colour_of_their_class(stage):
 
 @each_stage
 def test_labels_are_dashed_and_trails_and_arrows_are_drawn(stage):
-    labelled = share(draw_frame(stage, NOBODY, Boxes(), BOX), LABEL)
-    plain = share(draw_frame(stage, NOBODY, Boxes()), LABEL)
+    labelled = share(draw_frame(stage, NOBODY, Boxes(), BOX), LABEL, 40)
+    plain = share(draw_frame(stage, NOBODY, Boxes()), LABEL, 40)
     assert all(np.subtract(labelled, plain) > 10)
     still = Boxes(BOX, np.array([CAR]))
     trail = BOX[0, :3] - np.linspace(6, 0, 20)[:, None] * [0.0, 1.0, 0.0]
@@ -57,6 +57,7 @@ def test_labels_are_dashed_and_trails_and_arrows_are_drawn(stage):
 
 
 @each_stage
+@settings(max_examples=10)
 @given(st.integers(0, 1000))
 def test_the_order_of_points_and_boxes_does_not_matter(stage, seed):
     rng, scan = np.random.default_rng(seed), cloud(seed, 300)
