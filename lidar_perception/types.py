@@ -22,6 +22,7 @@ __all__ = ["CLASSES", "PEDESTRIAN", "Detections", "GroundTruth", "InputError", "
 
 MAX_RANGE = 1e5  # metres; what is farther is a broken return, not a point
 LIKELY = 0.6  # 0..1, see difflib: two names that are this similar may be the same one, misspelt
+BEGINNING = 3  # characters
 LARGEST = 1e9  # of the numbers of a label; what is larger is damaged
 SENSOR_HEIGHT = 1.73  # metres: KITTI's sensor above the road. Defaults, anchors and simulation
 
@@ -35,11 +36,12 @@ class InputWarning(UserWarning):
 
 
 def closest_name(name: object, known: Iterable[str]) -> str | None:
-    """Return the name of `known` that `name` is most likely meant to be, or None. A name that
-    begins with `name` comes before one that is spelt alike."""
+    """Return the name of `known` that `name` is most likely meant to be, or None: one that begins
+    with `name`, else one that is spelt alike, else one that begins alike."""
     wanted, plain = _plain(str(name)), {_plain(each): each for each in known}
-    longer = [each for each in plain if each.startswith(wanted)] if len(wanted) > 2 else []
-    found = longer or get_close_matches(wanted, plain, 1, LIKELY)
+    alike = [each for each in plain if each[:BEGINNING] == wanted[:BEGINNING]]
+    found = ([each for each in alike if each.startswith(wanted)]
+             or get_close_matches(wanted, plain, 1, LIKELY) or alike)
     return plain[found[0]] if found else None
 
 

@@ -43,7 +43,7 @@ def _runs() -> list[Runs]:
 @intervals_option
 @range_option
 @device_option
-@settings_options(lambda given: _runs())
+@settings_options(lambda given: _runs(), candidates=True)
 def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, range: str, device: str,
             settings: Settings, intervals: int) -> None:
     """Run all detectors on the same frames, in turns, and print scores and times side by side.

@@ -95,7 +95,7 @@ def data_argument(what: str = WHAT, *, required: bool = True, several: bool = Fa
     return decorate
 
 
-split_option = a_path("--split", "Only the frames, or whole sequences, named in this file, one a "
+split_option = a_path("--split", "Use only the frames or sequences named in this file, one per "
                       "line.")
 limit_option = click.option("--limit", type=click.IntRange(1), metavar="N",
                             help="Only the first N frames.")

@@ -68,7 +68,7 @@ def _runs(detector: str) -> Runs:
 @data_argument(f"Replay this instead of the simulated drive; it needs labelled boxes: {WHAT}",
                required=False)
 @click.option("--detector", type=Choice(ALONE), default=FUSED, show_default=True,
-              help="What detects.")
+              help="Detector to run.")
 @out_folder("Folder for the results.", default=Path("out/demo"), show_default=True)
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
               help="Length of the simulated drive, 10 frames a second.")
@@ -83,18 +83,18 @@ def _runs(detector: str) -> Runs:
                                                 "sent once those before it have their results.")
 @range_option
 @device_option
-@settings_options(lambda given: [_runs(given.get("detector") or FUSED)])
+@settings_options(lambda given: [_runs(given.get("detector") or FUSED)], candidates=True)
 def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: int, rate: float,
          single: bool, real_time: bool, range: str, device: str, settings: Settings) -> None:
     """Replay a drive through the real nodes over DDS, and score the detections and their tracks.
 
-    Without options: makes a simulated drive with traffic and walking pedestrians, writes it as a
+    Without options, makes a simulated drive with traffic and walking pedestrians, writes it as a
     rosbag2 bag, replays it into the nodes, each in its own process on a private ROS domain, and
     prints the scores. Leaves in --out: the bag, the result bag, scores.json, birdseye.png and the
     logs. With --detector candidates, pedestrians alone, by the protocol of the STM-CPA paper.
 
-    It scores, so DATA needs labelled boxes. A recording without labels is looked at with
-    `view PATH --weights fused`, and its sensor is measured with `setup`.
+    It scores, so DATA needs labelled boxes. For a recording without labels use
+    `detect` or `view DATA --weights fused`, and `setup` to measure its sensor.
 
     \b
     Examples:

@@ -74,7 +74,7 @@ def cli() -> None:
       lidar-perception convert /data/kitti/object --out kitti.bag
       lidar-perception evaluate candidates /data/kitti/object --json scores.json
       lidar-perception reproduce stm-cpa /data/kitti/object --out report
-      lidar-perception run perception --ros-args -r '~/input/points:=/points'
+      lidar-perception run fused_detector --ros-args -r '~/input/points:=/points'
 
     Exit codes: 0 done, 1 ran but something failed, 2 the command or its input cannot be used, 130
     stopped by ctrl-C.

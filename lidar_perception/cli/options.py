@@ -141,11 +141,17 @@ class SetOption(HelpfulOption):
         return f"; parameters are given as --set {known[plain]}=VALUE" if plain in known else ""
 
 
-def settings_options(runs: Callable[[Mapping[str, Any]], list[Runs]]) -> Callable:
+def settings_options(runs: Callable[[Mapping[str, Any]], list[Runs]],
+                     example: str = "fused.scores.car=0.7", candidates: bool = False) -> Callable:
     """Decorator: --config and --set, which the function gets as settings=Settings(...).
 
-    runs: takes the options that were given, by name, and says what runs, for `--set help`.
+    Args:
+        runs: returns what runs for the options that were given, for `--set help`.
+        example: of --set, for the help.
+        candidates: the candidates may run, which have named configurations.
     """
+    named = f" Or one of {', '.join(CONFIGURATIONS)}, for the candidates." if candidates else ""
+
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
         def wrapper(*args: Any, config: Path | None, given: tuple, **kwargs: Any) -> Any:
@@ -153,12 +159,11 @@ def settings_options(runs: Callable[[Mapping[str, Any]], list[Runs]]) -> Callabl
 
         wrapper = click.option(
             "--set", "given", cls=SetOption, runs=runs, multiple=True, type=Assignment(),
-            metavar="NAME=VALUE", help="Set a parameter, such as ground.method=patchwork; may be "
-            "repeated. `--set help` lists all, with units and defaults.")(wrapper)
+            metavar="NAME=VALUE", help=f"Set a parameter, such as {example}; may be repeated. "
+            "`--set help` lists all, with units and defaults.")(wrapper)
         return click.option(
-            "--config", type=click.Path(path_type=Path), metavar="FILE|NAME",
-            help="ROS parameter file, as in config/, or for candidates one of "
-            f"{', '.join(CONFIGURATIONS)}. --set takes precedence.")(wrapper)
+            "--config", type=click.Path(path_type=Path), metavar="FILE|NAME" if named else "FILE",
+            help=f"ROS parameter file, as in config/; --set takes precedence.{named}")(wrapper)
     return decorate
 
 
@@ -168,7 +173,8 @@ def candidates_run(on_messages: bool = False) -> Runs:
 
 
 def parameter_options(defaults: Any, name: str = CANDIDATES,
-                      nodes: Collection[str] | None = CANDIDATE_NODES) -> Callable:
+                      nodes: Collection[str] | None = CANDIDATE_NODES,
+                      example: str = "stm.threshold=0.5") -> Callable:
     """Decorator: --config and --set of one dataclass of parameters, which the function gets as
     params=."""
     runs = Runs(name, _read_here(parameter_fields(defaults), on_messages=False), nodes)
@@ -177,7 +183,7 @@ def parameter_options(defaults: Any, name: str = CANDIDATES,
         @functools.wraps(function)
         def wrapper(*args: Any, settings: Settings, **kwargs: Any) -> Any:
             return function(*args, params=checked(defaults, settings.values(runs)[0]), **kwargs)
-        return settings_options(lambda _: [runs])(wrapper)
+        return settings_options(lambda _: [runs], example, name == CANDIDATES)(wrapper)
     return decorate
 
 
@@ -220,9 +226,10 @@ class Tracked:
 TRACKER = Runs("the tracker", parameter_fields(Tracked()), ("tracker",))
 
 range_option = click.option("--range", type=Choice(RANGE_CHOICES), default="auto",
-                            show_default=True, help="What the detector sees: 69 m ahead, or 51 m "
-                            "to every side, which takes over twice as long. auto: what its weights "
-                            "were trained for; those that come with the package: ahead.")
+                            show_default=True, help="Range of the detector: 69 m ahead, or 51 m "
+                            "to every side, which takes more than twice as long. auto: the range "
+                            "that its weights were trained for, which is ahead for those that come "
+                            "with the package.")
 device_option = click.option("--device", default="auto", show_default=True,
                              help="Where networks run: auto, cpu, cuda or cuda:N.")
 

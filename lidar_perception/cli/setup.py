@@ -27,13 +27,12 @@ HINT_TOLERANCE = 0.1  # metres
 @data_argument("A bag, a .pcd, .ply, .npy or .bin file or a folder of them, or the folder of a "
                "data set. No label is needed.")
 @out_folder("Folder for the files.", required=True)
-@click.option("--topic", metavar="TOPIC", help="Clouds of a bag that holds those of several "
+@click.option("--topic", metavar="TOPIC", help="Topic of the clouds, for a bag with several "
               "sensors.")
 @click.option("--scans", type=click.IntRange(1), default=40, show_default=True,
               help="Number of clouds to look at, in pairs spread over all.")
 @click.option("--height-hint", type=click.FloatRange(0, 50, min_open=True), metavar="METRES",
-              help="Height of the sensor as you know it; a doubt is said where the clouds say "
-              "another one.")
+              help="Known height of the sensor, to check against the clouds.")
 @click.option("--force", is_flag=True, help="Replace the files of an earlier run.")
 def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: float | None,
           force: bool) -> None:
@@ -41,13 +40,13 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
 
     Writes sensor.yaml, which `simulate --sensor` and `train --sensor` take, robot.param.yaml for
     the nodes, layouts for RViz and Foxglove, and report.html, which says how each value was
-    measured and how sure it is. Best are some minutes of driving in the open.
+    measured and how sure it is. Works best with some minutes of driving in open space.
 
     \b
     Examples:
       lidar-perception setup drive.bag --topic /points --out robot
       lidar-perception simulate --sensor robot/sensor.yaml --out street
-      lidar-perception run perception --ros-args --params-file robot/robot.param.yaml
+      lidar-perception run fused_detector --ros-args --params-file robot/robot.param.yaml
     """
     there = [name for name in FILES if (out / name).exists()]
     if there and not force:

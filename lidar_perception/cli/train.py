@@ -36,7 +36,7 @@ OPTIONS = (
                  "simulated streets."),
     a_path("--split", "Train on the frames of --data, or whole sequences, that are named in this "
            "file, one a line."),
-    a_path("--val-split", "Likewise the frames to validate on."),
+    a_path("--val-split", "Validate on the frames or sequences named in this file."),
     out_folder("Folder for best.safetensors, last.safetensors, logs and the state.", required=True),
     click.option("--resume", is_flag=True, help="Resume the run in --out, if there is one."),
     a_path("--init", "Start from the weights of this checkpoint, as far as they fit; `package`: "
@@ -76,7 +76,7 @@ def training_options(defaults: Any) -> Callable:
 
         for name, f in reversed(named.items()):
             wrapper = _flag(name, f)(wrapper)
-        return parameter_options(defaults, "training", None)(wrapper)
+        return parameter_options(defaults, "training", None, "scene=campus")(wrapper)
     return decorate
 
 
@@ -102,7 +102,7 @@ def train() -> None:
 @shared_options
 @training_options(PointPillarsTraining())
 def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
-    """PointPillars and EG-PointPillars, on labelled frames, simulated streets, or both.
+    """Train PointPillars or EG-PointPillars on labelled frames, simulated streets, or both.
 
     Scans, steps and validations are chosen so that all ends within --budget hours on this machine.
     OUT/best.safetensors holds the weights with the best validation AP so far. Ctrl-C saves and
@@ -129,7 +129,7 @@ def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
 @shared_options
 @training_options(PointNetTraining())
 def pointnet(asked: Asked, params: PointNetTraining) -> None:
-    """The cluster network (PointNet), on labelled frames, simulated streets, or both.
+    """Train the cluster network (PointNet) on labelled frames, simulated streets, or both.
 
     Scenes are cut into clusters by the package's own ground and clustering. Scans and steps are
     chosen so that all ends within --budget hours on this machine. The best weights so far lie in
@@ -161,7 +161,7 @@ def pointnet(asked: Asked, params: PointNetTraining) -> None:
 @training_options(FusedTraining())
 def fused(weights: Path | None, classifier: Path | None, out: Path, force: bool, jobs: int,
           params: FusedTraining) -> None:
-    """The fused detector of your own weights: fit how much each source counts.
+    """Fit the fused detector to your own weights: how much each source counts.
 
     PointPillars, silhouettes and the cluster network look at simulated scans of the sensor that
     the weights were trained for. What they say together becomes a probability, so that the

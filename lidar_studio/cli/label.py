@@ -55,7 +55,7 @@ def label(data: Path, sequence: str | None, out: Path | None, detector: Detector
           simulate_annotator: bool, json_file: Path | None, **page: Any) -> None:
     """Label a drive on a page in the browser: click, accept, correct.
 
-    Everything is kept at once in FOLDER/journal.jsonl; ctrl-C ends.
+    Every action is saved at once to FOLDER/journal.jsonl; ctrl-C ends.
 
     \b
     Examples:

@@ -47,15 +47,15 @@ WEIGHTS = (".safetensors", ".onnx", ".json")
 @click.option("--frame", type=click.IntRange(0), default=0, show_default=True, metavar="N",
               help="Frame to begin with.")
 @click.option("--theme", type=Choice(["auto", "light", "dark"]), default="auto",
-              show_default=True, help="Of the page.")
+              show_default=True, help="Colours of the page.")
 def view(data: Path | None, live: bool, detectors: tuple[DetectorChoice, ...],
          results: tuple[Path, ...], points: str | None, detections: tuple[str, ...],
          namespace: str, sequence: str | None, port: int, browser: bool, screenshot: Path | None,
          frame: int, theme: str) -> None:
     """Look at a recording and its results on a page in the browser: clouds with ground and
     clusters, labels, detections by source and score, missed and false ones, tracks. DATA is a
-    bag, such as the result bag of the demo, or the folder of a data set; with --live the nodes
-    that run on this ROS_DOMAIN_ID are looked at, the newest frame first.
+    bag, such as the result bag of the demo, or the folder of a data set; --live shows the nodes
+    that run on this ROS_DOMAIN_ID, the newest frame first.
 
     \b
     Examples:

@@ -31,7 +31,7 @@ from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.param_fields import parameter_fields, with_values
 from lidar_perception.runs.terminal import Terminal
 from lidar_perception.scoring.tables import narrow_table
-from lidar_perception.types import InputError
+from lidar_perception.types import InputError, closest_name
 from lidar_perception.wire.topics import POINTS, TRUTH
 
 STAGES = ("stage1", "stage2", "final")
@@ -561,6 +561,16 @@ def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch,
 def test_a_command_that_cannot_be_used_is_exit_code_2(arguments, words, monkeypatch, capsys):
     assert exit_of(monkeypatch, *arguments) == 2
     assert words in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(("name", "known", "closest"), [
+    ("fussed", ["pointnet", "fused"], "fused"), ("fused", ["tracker", "fused_detector"],
+                                                 "fused_detector"),
+    ("vlp99", ["hdl-64e", "vlp-16", "vlp-32c"], "vlp-16"), ("KITTI_traking", ["kitti-tracking"],
+                                                           "kitti-tracking"),
+    ("luck", ["seeds", "points"], None), ("", ["a"], None), (None, ["x"], None)])
+def test_the_closest_name_is_found_where_there_is_one(name, known, closest):
+    assert closest_name(name, known) == closest
 
 
 @pytest.mark.parametrize("arguments, code, words", [

@@ -33,7 +33,7 @@ def as_recorded(recording: Any, params: PipelineParams) -> PipelineParams:
 @out_file("--png", "Draw the frame with most pedestrians from above.")
 @parameter_options(PAPER)
 def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
-    """Pedestrian candidates of the STM-CPA paper against the Pedestrian labels.
+    """Score the pedestrian candidates of the STM-CPA paper against Pedestrian labels.
 
     The paper's protocol unless --config or --set change it: frames with a pedestrian, points in the
     camera's view, the nearest labelled pedestrian as seed, hits within 1.0 m of the 3D centre.

@@ -10,15 +10,24 @@ import click
 from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import Walk, a_path, no_labels, walk_options
 from lidar_perception.cli.options import Runs, Settings, checked, settings_options
-from lidar_perception.detectors.open import default_params
+from lidar_perception.detectors.open import POINTNET, default_params, kind_and_file
 from lidar_perception.detectors.pointnet.weights_file import WEIGHTS
 from lidar_perception.param_fields import parameter_fields
 from lidar_perception.runs.terminal import console
+from lidar_perception.types import InputError
+
+
+def _file(weights: Path | None) -> Path:
+    """The checkpoint of --weights. InputError if that is another detector."""
+    kind, path = (POINTNET, None) if weights is None else kind_and_file(weights)
+    if kind != POINTNET:
+        raise InputError(f"{weights} is a detector {kind}; give a checkpoint of {POINTNET}")
+    return path or WEIGHTS
 
 
 def _runs(weights: Path | None) -> Runs:
     """Ground and clustering, with the parameters that the network was trained with."""
-    fields = parameter_fields(default_params(weights or WEIGHTS))
+    fields = parameter_fields(default_params(_file(weights)))
     return Runs("ground and clustering", {name: f for name, f in fields.items()
                                  if name.startswith(("ground.", "clustering."))},
                 ("pointnet_detector",))
@@ -28,9 +37,9 @@ def _runs(weights: Path | None) -> Runs:
 @walk_options()
 @a_path("--weights", "Checkpoint of a cluster network. Default: the one that comes with the "
         "package.")
-@settings_options(lambda given: [_runs(given.get("weights"))])
+@settings_options(lambda given: [_runs(given.get("weights"))], "clustering.density=0")
 def clusters(walk: Walk, weights: Path | None, settings: Settings) -> None:
-    """Classes that the cluster network (PointNet) assigns to clusters and their points.
+    """Score the classes that the cluster network (PointNet) assigns to clusters and points.
 
     Clusters are made as for its training, unless --config or --set change that. A cluster is an
     object if at least half of its points lie in the object's box, and background if less than 15
@@ -47,7 +56,7 @@ def clusters(walk: Walk, weights: Path | None, settings: Settings) -> None:
     from lidar_perception.scoring.points.cluster_tables import print_cluster_scores
     from lidar_perception.scoring.points.clusters import ClusterScores, by_network
 
-    file = weights or WEIGHTS
+    file = _file(weights)
     values, = settings.values(_runs(weights)) if settings else [{}]
     checked(default_params(file), values)
     scores = ClusterScores(read_header(file, PointNetConfig).config.classes)

@@ -40,20 +40,20 @@ from lidar_perception.types import InputError
               "else what its first clouds show.")
 @out_folder("Write the detections of --weights as KITTI result files, also for frames without "
             "labels.", "--write-results")
-@click.option("--errors", is_flag=True, help="Also say where found boxes differ from the true "
-              "ones, by class and range, what each difference costs, and whether scores are the "
-              "share of boxes that are right.")
+@click.option("--errors", is_flag=True, help="Also print how found boxes differ from the true "
+              "ones, by class and range, what each difference costs, and whether scores are "
+              "probabilities.")
 @click.option("--errors-from", type=click.FloatRange(0, 1), default=0.2, show_default=True,
-              metavar="SCORE", help="With --errors: of boxes from this score on.")
+              metavar="SCORE", help="With --errors: look at boxes from this score on.")
 @intervals_option
 def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None, min_score: float,
               keep: float, mount_height: float, write_results: Path | None, errors: bool,
               errors_from: float, intervals: int) -> None:
-    """Boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
+    """Score boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
 
-    Average precision in the image, from above and in space, and of orientation, at 40 and 11
-    recall points; pedestrians by centre distance as in the STM-CPA paper. Scores the result files
-    of any detector, or runs one on every scan: a checkpoint, or without any the fused detector.
+    Prints average precision of 2D, BEV and 3D boxes and of orientation at 40 and 11 recall points,
+    and pedestrians by centre distance as in the STM-CPA paper. Scores the result files of any
+    detector, or runs one on every scan: by default fused.
 
     \b
     Examples:

@@ -25,11 +25,11 @@ from lidar_perception.types import InputError
                              "without labels.")
 def nuscenes(walk: Walk, results: Path | None, detector: DetectorChoice | None,
              write_results: Path | None) -> None:
-    """Boxes by the protocol of nuScenes' detection task.
+    """Score boxes by the protocol of nuScenes' detection task.
 
     Average precision by centre distance at 0.5, 1, 2 and 4 m, the five errors of true positives and
     NDS, over all ten classes, and over the three that our detectors know. Scores either a result
-    file, or a checkpoint, which is run on every key frame. PATH is the folder of nuScenes, or that
+    file, or a checkpoint, which is run on every key frame. DATA is the folder of nuScenes, or that
     of one version in it; --split names scenes.
 
     \b

@@ -24,6 +24,7 @@ from lidar_perception.clustering.params import CLUSTERING_METHODS
 from lidar_perception.ground.params import GROUND_METHODS
 from lidar_perception.runs.terminal import console, errors
 from lidar_perception.scoring.points.report import SegmentationParams
+from lidar_perception.types import valid_names
 
 
 class MethodList(click.ParamType):
@@ -35,7 +36,8 @@ class MethodList(click.ParamType):
         names = value if isinstance(value, tuple) else tuple(str(value).split(","))
         known = GROUND_METHODS + CLUSTERING_METHODS
         if unknown := [name for name in names if name not in known]:
-            self.fail(f"{unknown[0]!r} is no method; known are {', '.join(known)}", param, ctx)
+            self.fail(f"there is no method {unknown[0]!r}{valid_names(unknown[0], known)}", param,
+                      ctx)
         return names
 
 
@@ -46,9 +48,10 @@ class MethodList(click.ParamType):
               "Default: all.")
 @out_file("--png", "Draw the ground of the first scan with labelled points from above.")
 @parameter_options(SegmentationParams(), "segmentation",
-                   ("perception", "ground_segmentation", "clustering"))
+                   ("perception", "ground_segmentation", "clustering"),
+                   "ground.method=patchwork")
 def segmentation(walk: Walk, methods: tuple, png: Path | None, params: SegmentationParams) -> None:
-    """Ground and clusters against labels.
+    """Score ground and clusters against labels.
 
     Ground: each method against the classes of SemanticKITTI's points. Clusters: each method, on
     what ground.method leaves, against SemanticKITTI's instances or labelled boxes; with boxes,

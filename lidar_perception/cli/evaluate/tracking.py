@@ -36,7 +36,7 @@ from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams
 @json_option
 def tracking(data: Path, split: Path | None, limit: int | None, detector: DetectorChoice,
              tracking: TrackingParams, ego: str, json_file: Path | None) -> None:
-    """HOTA, CLEAR MOT and AB3DMOT's scores of Car, Pedestrian and Cyclist.
+    """Score tracks of Car, Pedestrian and Cyclist: HOTA, CLEAR MOT and AB3DMOT.
 
     The labels need track ids, and the frames of a drive come one after the other, so this runs in
     one process.
