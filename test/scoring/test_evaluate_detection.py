@@ -199,6 +199,15 @@ def test_result_files_hold_what_was_found(tmp_path):
     assert len(read_results(path, CALIBRATION.lidar_to_camera)) == 0
 
 
+def test_result_files_keep_the_order_of_weak_scores(tmp_path):
+    """Average precision is made of many boxes just above its least score."""
+    scores = np.float32(0.001 + 3e-6 * np.arange(100))
+    write_results(tmp_path / "a.txt", Detections.of(np.tile([20.0, 0, -1, 4, 2, 1.5, 0], (100, 1)),
+                                                    0, scores), CALIBRATION)
+    back = read_results(tmp_path / "a.txt", CALIBRATION.lidar_to_camera)
+    assert (np.diff([e["score"] for e in back.extras]) > 0).all()
+
+
 def test_frames_without_labels_are_written_and_not_scored(kitti, detector, tmp_path, monkeypatch,
                                                           capsys):
     (kitti / "training/label_2/000001.txt").unlink()

@@ -23,7 +23,7 @@ from lidar_perception.runs.files import write_text
 from lidar_perception.types import Detections, GroundTruth, InputError
 
 FOLDER = "kitti"  # of result files in the folder of a run
-DECIMALS = 4  # of a score, so that the order stays, and of metres, so that overlaps do
+DECIMALS = 6  # of a score, so that the order of weak ones stays, and of metres, so that overlaps do
 
 
 def result_files(folder: Path) -> Path:
