@@ -14,9 +14,13 @@ from benchmark.timing import SLOW_REPEAT, Clock, evenly_chosen, thin
 from lidar_perception.data.frame import Frame
 from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.params import ClothParams, GroundParams, ThresholdParams
-from lidar_perception.ground.patchwork import segment_by_patchwork, silent_stdout
+from lidar_perception.ground.patchwork import segment_by_patchwork, silence_stdout
 from lidar_perception.ground.segment import METHODS
-from lidar_perception.ground.threshold import height_above, ransac_plane, segment_by_threshold
+from lidar_perception.ground.threshold import (
+    fit_plane_by_ransac,
+    height_above_plane,
+    segment_by_threshold,
+)
 from lidar_perception.runs.terminal import track
 from lidar_perception.scoring.points.segmentation import PROTOCOLS, GroundReport, ground_by_protocol
 from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
@@ -64,7 +68,7 @@ def _plane_differences(clouds: list[np.ndarray], found: list[tuple]) -> dict:
     cm at the sensor and degrees, median and max over the frames; and in how many of these either
     plane has more inliers."""
     low = [xyz[_low(xyz)] for xyz in clouds]
-    ours = [ransac_plane(points, PARAMS.threshold) for points in low]
+    ours = [fit_plane_by_ransac(points, PARAMS.threshold) for points in low]
     theirs = [plane for _, plane, _ in found]
     settled = [_settled(points.astype(np.float64), plane) for points, plane in zip(low, theirs)]
     trials = float(np.median([trials for _, _, trials in found]))
@@ -87,7 +91,8 @@ def _plane_differences(clouds: list[np.ndarray], found: list[tuple]) -> dict:
 
 
 def _inliers(points: np.ndarray, plane: np.ndarray) -> int:
-    return int((np.abs(height_above(points, plane)) <= PARAMS.threshold.inlier_distance).sum())
+    height = height_above_plane(points, plane)
+    return int((np.abs(height) <= PARAMS.threshold.inlier_distance).sum())
 
 
 def _settled(points: np.ndarray, plane: np.ndarray,
@@ -95,7 +100,7 @@ def _settled(points: np.ndarray, plane: np.ndarray,
     """Least squares on the inliers until these no longer change."""
     before = None
     for _ in range(100):
-        near = np.abs(height_above(points, plane)) <= params.inlier_distance
+        near = np.abs(height_above_plane(points, plane)) <= params.inlier_distance
         if before is not None and np.array_equal(near, before):
             break
         columns = np.column_stack([points[near, :2], np.ones(near.sum())])
@@ -115,7 +120,7 @@ def measure_patchwork(frames: list[LidarFrame], repeat: int) -> dict:
                 "ours": partial(segment_by_patchwork, frame.xyz, frame.intensity, SENSOR_HEIGHT)}
 
     same = 0
-    with silent_stdout():
+    with silence_stdout():
         clock = Clock(repeat, calls(frames[0], _with_intensity(frames[0])))
         for frame in track(frames, title, len(frames)):
             found = clock.time(calls(frame, _with_intensity(frame)))
@@ -148,7 +153,7 @@ def measure_cloth(scans: list[np.ndarray], repeat: int) -> dict:
     def calls(xyz, precise):
         return {name: partial(peers.CLOTH.run, precise), "ours": partial(segment_by_cloth, xyz)}
 
-    with silent_stdout():
+    with silence_stdout():
         clock = Clock(min(repeat, SLOW_REPEAT), calls(*_both(thin(scans[0]))))
         for xyz in track(scans, title, len(scans)):
             clock.time(calls(*_both(xyz)))
@@ -173,7 +178,7 @@ def measure_labelled(frames: list[Frame], repeat: int) -> dict:
     def calls(frame):
         return {name: partial(methods[name], frame) for name in reports}
 
-    with silent_stdout():
+    with silence_stdout():
         clock = None
         for item in track(frames, "ground of labelled scans", len(frames)):
             frame, semantic = item.load(), item.point_truth().classes

@@ -13,7 +13,7 @@ import numpy as np
 from lidar_perception.clustering.params import DbscanParams
 from lidar_perception.geometry import horizontal_range
 from lidar_perception.ground.params import ClothParams, PatchworkParams
-from lidar_perception.ground.patchwork import library_settings
+from lidar_perception.ground.patchwork import make_library_settings
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def _bare_patchwork(points: np.ndarray, sensor_height: float,
                     params: PatchworkParams = PatchworkParams()) -> np.ndarray:
     """Indices of the ground among points (N, 4) float32, by a new object."""
     import pypatchworkpp
-    engine = pypatchworkpp.patchworkpp(library_settings(sensor_height, params))
+    engine = pypatchworkpp.patchworkpp(make_library_settings(sensor_height, params))
     engine.estimateGround(points)
     return engine.getGroundIndices()
 

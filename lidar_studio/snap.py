@@ -11,7 +11,7 @@ from lidar_perception.candidates.seeds import clicked_cluster
 from lidar_perception.classes import DETECTED, Size
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.geometry import points_in_box, to_box_frame, wrap_angle
-from lidar_perception.ground.surface import surface_under
+from lidar_perception.ground.surface import fit_ground_heights
 from lidar_perception.types import InputError
 from lidar_studio.drive import Scan
 
@@ -68,7 +68,7 @@ def _floor(scan: Scan, box: Array) -> float:
     """z of the ground under a box (7,), or of the nearest ground where few of its points are seen;
     NaN where there is none."""
     ground = scan.xyz[scan.ground]
-    floor = float(surface_under(ground, box[None, :2])[0])
+    floor = float(fit_ground_heights(ground, box[None, :2])[0])
     if np.isfinite(floor) or len(ground) < NEAREST:
         return floor
     apart = np.hypot(*(ground[:, :2] - box[:2]).T)

@@ -31,7 +31,7 @@ from experiments.realism.scan_statistics import (
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.refine import STAGES
 from lidar_perception.data.frame import Frame, Recording
-from lidar_perception.ground.params import mounted
+from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.matching import RANGE_NAMES
 from lidar_perception.scoring.centres.report import CandidateReport, of_frame
@@ -59,7 +59,7 @@ class Measured:
         A scan that is cropped to the camera's view counts for its objects only. InputError where it
         cannot be read."""
         scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
-        protocol = mounted(protocol, frame.sensor_height)
+        protocol = set_sensor_height(protocol, frame.sensor_height)
         # The threshold's trial planes depend on the order of the points; here nothing shall.
         scan = scan.take(np.lexsort(scan.xyz.T))
         frame = Frame.of(frame.name, scan, truth, calibration)

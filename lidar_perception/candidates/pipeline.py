@@ -20,7 +20,7 @@ from lidar_perception.candidates.refine import Candidates, refine
 from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import Segmented, grounded_boxes, points_in_view
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.ground.segment import cropped_as_mounted, segment_ground
+from lidar_perception.ground.segment import crop_with_sensor_pose, segment_ground
 from lidar_perception.groups import renumbered
 from lidar_perception.types import LidarFrame, as_frame, check_columns
 
@@ -35,7 +35,7 @@ def segment(cloud: LidarFrame | ArrayLike, camera: Camera | None = None,
     t0 = perf_counter()
     frame = as_frame(cloud)
     check_columns(len(frame), ground=ground, cluster_ids=cluster_ids)
-    kept, frame = cropped_as_mounted(frame, params.crop, params.ground.sensor_pose)
+    kept, frame = crop_with_sensor_pose(frame, params.crop, params.ground.sensor_pose)
     indices, seen = points_in_view(frame, camera, params.view)
     indices = kept.take(indices)
     t1 = perf_counter()

@@ -172,15 +172,19 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     """Open the recording at a path, see data.open.open_recording, and print its summary. The height
     of a sensor that the recording does not give is measured, unless it is about KITTI's. With level
     a sensor that leans and the scale of the intensity are reported."""
+    from lidar_perception.data.mount_check import (
+        apply_measured_height,
+        find_mount_problem,
+        load_first_clouds,
+    )
     from lidar_perception.data.open import open_recording
-    from lidar_perception.ground.segment import first_clouds, mount_problem, mounted
     from lidar_perception.wire.messages import recorded_intensity_problem
     recording = open_recording(data, **how)
     errors.print(str(recording), style="dim")
     for line in lost_labels(recording):
         errors.print(line, style="yellow")
-    clouds = first_clouds(recording)
-    measured = mounted(recording, clouds)
+    clouds = load_first_clouds(recording)
+    measured = apply_measured_height(recording, clouds)
     if measured is not recording:
         height = next(iter(measured)).sensor_height
         errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds",
@@ -189,7 +193,7 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
         if (full := recording.frames[0].intensity_max()) > 1:
             errors.print(f"its intensity is 0 .. {full:g}, read as 0 .. 1", style="dim")
         for problem in filter(None, (
-                None if recording.mounted else mount_problem(recording, clouds),
+                None if recording.mounted else find_mount_problem(recording, clouds),
                 recorded_intensity_problem(recording.path, clouds))):
             errors.print(problem, style="yellow")
     return measured
@@ -203,11 +207,11 @@ def lost_labels(recording: Any) -> list[str]:
 
 def as_mounted(recording: Any, params: Any) -> Any:
     """params with the height of the recording's sensor, unless they have another than KITTI's."""
-    from lidar_perception.ground.params import mounted
+    from lidar_perception.ground.params import set_sensor_height
     from lidar_perception.types import SENSOR_HEIGHT
     if params.ground.sensor_pose.height != SENSOR_HEIGHT:
         return params
-    return mounted(params, recording.frames[0].sensor_height)
+    return set_sensor_height(params, recording.frames[0].sensor_height)
 
 
 def write_json(path: Path | None, content: dict) -> None:

@@ -17,8 +17,8 @@ from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Cloud, Found, accept, joined
 from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
-from lidar_perception.ground.params import mounted
-from lidar_perception.ground.segment import cropped_as_mounted
+from lidar_perception.ground.params import set_sensor_height
+from lidar_perception.ground.segment import crop_with_sensor_pose
 from lidar_perception.intensity import MIN_POINTS
 from lidar_perception.types import InputError, LidarFrame
 
@@ -49,8 +49,8 @@ class NetworkDetector:
         frame, ground, cluster_ids, problem = accept(cloud, ground, cluster_ids,
                                                      self.settings.intensity_scale)
         if self.params.crop.enabled:
-            kept, frame = cropped_as_mounted(frame, self.params.crop,
-                                             self.params.ground.sensor_pose)
+            kept, frame = crop_with_sensor_pose(frame, self.params.crop,
+                                                self.params.ground.sensor_pose)
             ground, cluster_ids = (column if column is None else column.take(kept)
                                    for column in (ground, cluster_ids))
         found = self.detect(frame, ground, cluster_ids)
@@ -127,7 +127,7 @@ class NetworkDetector:
     def mounted_at(self, height: float) -> Self:
         """The same detector, of the same network, for a sensor so many metres above the ground."""
         other = copy.copy(self)
-        other.params = mounted(self.params, height)
+        other.params = set_sensor_height(self.params, height)
         return other
 
     def bring_to(self, device: torch.device) -> None:

@@ -13,7 +13,7 @@ from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import explain_nothing
 from lidar_perception.detectors.contract import Cloud, Found, accept
-from lidar_perception.ground.params import mounted
+from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, PEDESTRIAN
 
@@ -50,7 +50,7 @@ class CandidateDetector:
 
     def mounted_at(self, height: float) -> CandidateDetector:
         """The same detector for a sensor so many metres above the ground."""
-        return CandidateDetector(self.seed, self.camera, mounted(self.params, height))
+        return CandidateDetector(self.seed, self.camera, set_sensor_height(self.params, height))
 
     def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:

@@ -10,7 +10,7 @@ from lidar_perception.classes import CAR
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.ground.params import GroundParams, SensorPoseParams
-from lidar_perception.ground.segment import level, segment_ground
+from lidar_perception.ground.segment import level_points, segment_ground
 from lidar_perception.types import SENSOR_HEIGHT, Detections, LidarFrame
 
 MAST = 1.0   # metres; a car that passes below a sensor on a gantry is farther away
@@ -22,7 +22,7 @@ def visible(frame: LidarFrame, config: NetworkConfig,
     """indices (M,) int64 of the frame's points in the network's range, and the frame of these, its
     coordinates levelled and as from SENSOR_HEIGHT. Points that are not finite are left out."""
     up = np.array([0, 0, pose.height - SENSOR_HEIGHT], np.float32)
-    xyz = level(frame.xyz, pose)
+    xyz = level_points(frame.xyz, pose)
     with np.errstate(invalid="ignore"):
         inside = np.ones(len(xyz), bool)
         for axis in range(3):
@@ -35,7 +35,7 @@ def visible(frame: LidarFrame, config: NetworkConfig,
 
 def levelled(frame: LidarFrame, pose: SensorPoseParams) -> LidarFrame:
     """All points of the frame, as from a level sensor at SENSOR_HEIGHT."""
-    xyz, shift = level(frame.xyz, pose), np.float32(pose.height - SENSOR_HEIGHT)
+    xyz, shift = level_points(frame.xyz, pose), np.float32(pose.height - SENSOR_HEIGHT)
     return replace(frame, xyz=xyz + np.array([0, 0, shift], np.float32) if shift else xyz)
 
 
@@ -44,7 +44,7 @@ def in_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detection
     boxes = detections.boxes.copy()
     boxes[:, 2] -= pose.height - SENSOR_HEIGHT
     if pose.roll or pose.pitch:
-        back = level(np.eye(3, dtype=np.float32), pose).T
+        back = level_points(np.eye(3, dtype=np.float32), pose).T
         heading = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])], axis=1) @ back[:2]
         boxes[:, :3] = boxes[:, :3] @ back
         boxes[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])

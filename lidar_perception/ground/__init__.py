@@ -1,1 +1,1 @@
-"""Ground segmentation: a frame to an (N,) bool mask, True = ground."""
+"""Ground segmentation: a cloud to an (N,) bool mask, True = ground."""

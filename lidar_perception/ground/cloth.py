@@ -1,10 +1,10 @@
 """Ground by cloth simulation (paper C, Eq. 2 and 3; Zhang et al., Remote Sensing 2016, 8, 501).
 
-The cloud is turned over, a cloth falls on it, and what lies on the cloth is ground. Only where the
-cloth comes to rest matters, so that is computed directly and not by letting it fall: seen upright,
-the cloth is pressed up against the lowest points. At rest each particle either touches the lowest
-point of its cell, or hangs free between its neighbours, bent by the load. There is one such state,
-whatever the order of the points and of the steps (see obstacle.py).
+In the paper, a cloth falls onto the inverted cloud, and the points near the cloth are ground. Only
+the final position of the cloth matters, so it is computed directly instead of simulating the fall:
+seen upright, the cloth is pressed up against the lowest points. At rest, each particle either
+touches the lowest point of its cell or hangs free between its neighbours, bent by the load. This
+state is unique and does not depend on the order of points or steps (see cloth_solver.py).
 """
 
 from __future__ import annotations
@@ -14,20 +14,23 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from lidar_perception.ground.climbing import UNOBSERVED, climbed_cells
-from lidar_perception.ground.obstacle import at_rest
+from lidar_perception.ground.cloth_slopes import UNOBSERVED, find_climbing_cells
+from lidar_perception.ground.cloth_solver import settle_sheet
 from lidar_perception.ground.params import ClothParams
 
-LEVELS = 6         # grids of the solver, each twice as coarse as the one before
-TOLERANCE = 0.001  # m that a particle may still move
-SQUARES = (2, 6)   # cells around one that are asked whether it is sunk
-SUNK = 0.4         # m under its surroundings from which a lone lowest point is a reflection
+GRID_LEVELS = 6        # grids of the solver, each twice as coarse as the previous one
+TOLERANCE_M = 0.001    # largest movement of a particle in the last step
+SUNK_WINDOWS = (2, 6)  # half widths, in cells, of the squares around a cell that may be sunk
+SUNK_DEPTH_M = 0.4     # a lone lowest point this far below its surroundings is a reflection
 
 
 class Cloth(NamedTuple):
-    """height (R, C) float32 of the particles, m; particle (r, c) is at x = x0 + c * resolution,
-    y = y0 + r * resolution. lowest (R, C) float32: the lowest point of the cell around each, inf
-    where there is none."""
+    """Cloth at rest.
+
+    height (R, C) float32 are the particles' heights in metres; particle (r, c) is at
+    x = x0 + c * resolution, y = y0 + r * resolution. lowest (R, C) float32 is the lowest point of
+    the cell around each, inf for cells without points.
+    """
 
     height: np.ndarray
     x0: float
@@ -37,43 +40,48 @@ class Cloth(NamedTuple):
 
 
 def segment_by_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()) -> np.ndarray:
-    """(N,) bool, True = ground: points (N, 3) float32, finite, within class_threshold of the
-    cloth, vertically (Eq. 3), or of the lowest point of a cell that the ground climbs to. Points
-    beyond max_range are not ground."""
+    """Segment the ground of finite points (N, 3) float32.
+
+    Returns:
+        (N,) bool, True = ground: points within class_threshold of the cloth along z (Eq. 3), or of
+        the lowest point of a cell that continues the ground uphill. Points beyond max_range are not
+        ground.
+    """
     cloth = lay_cloth(xyz, params)
     if cloth is None:
         return np.zeros(len(xyz), bool)
     climbed = np.full(cloth.height.shape, -UNOBSERVED, np.float32)
     if params.slope > 0.0:
-        reached = climbed_cells(cloth.lowest, cloth.height, params.class_threshold,
-                                params.slope * cloth.resolution)
+        reached = find_climbing_cells(cloth.lowest, cloth.height, params.class_threshold,
+                                      params.slope * cloth.resolution)
         climbed[reached] = cloth.lowest[reached]
-    return _near_cloth(xyz, cloth.height, climbed, cloth.x0, cloth.y0, 1.0 / cloth.resolution,
-                       params.max_range, params.class_threshold)
+    return _select_near_cloth(xyz, cloth.height, climbed, cloth.x0, cloth.y0,
+                              1.0 / cloth.resolution, params.max_range, params.class_threshold)
 
 
 def lay_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()) -> Cloth | None:
-    """The cloth at rest under points (N, 3); None where no point is within max_range."""
-    # Cells at whole multiples of the coarsest size: a far point adds cells and moves none.
-    block = 2 ** (LEVELS - 1)
-    low_x, low_y, high_x, high_y = _bounds(xyz, params.max_range)
+    """Return the cloth at rest under points (N, 3); None if no point is within max_range."""
+    # Cells start at multiples of the coarsest size, so that a far point adds cells but moves none.
+    block = 2 ** (GRID_LEVELS - 1)
+    low_x, low_y, high_x, high_y = _find_bounds(xyz, params.max_range)
     if low_x > high_x:
         return None
     size = params.resolution * block
     first = np.floor([low_x / size, low_y / size])
     columns, rows = ((np.floor([high_x / size, high_y / size]) - first + 1) * block).astype(int)
     x0, y0 = first * size
-    lowest = _lowest_points(xyz, params.max_range, x0, y0, 1.0 / params.resolution, rows, columns)
-    _drop_sunk(lowest, SUNK)
+    lowest = _find_lowest_points(xyz, params.max_range, x0, y0, 1.0 / params.resolution, rows,
+                                 columns)
+    _drop_sunk_cells(lowest, SUNK_DEPTH_M)
     lift = params.curvature * params.resolution**2 / 4
     half = params.resolution / 2
-    return Cloth(at_rest(lowest, lift, TOLERANCE, LEVELS), float(x0) + half, float(y0) + half,
-                 params.resolution, lowest)
+    height = settle_sheet(lowest, lift, TOLERANCE_M, GRID_LEVELS)
+    return Cloth(height, float(x0) + half, float(y0) + half, params.resolution, lowest)
 
 
 @njit(cache=True, nogil=True)
-def _bounds(xyz, max_range):
-    """[low x, low y, high x, high y] of the points within max_range along x and y."""
+def _find_bounds(xyz, max_range):
+    """Return [low x, low y, high x, high y] of the points within max_range along x and y."""
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
     for i in range(len(xyz)):
         x, y = np.float64(xyz[i, 0]), np.float64(xyz[i, 1])
@@ -84,8 +92,8 @@ def _bounds(xyz, max_range):
 
 
 @njit(cache=True, nogil=True)
-def _lowest_points(xyz, max_range, x0, y0, scale, rows, columns):
-    """(rows, columns) z of the lowest point in each cell, UNOBSERVED where there is none."""
+def _find_lowest_points(xyz, max_range, x0, y0, scale, rows, columns):
+    """Return (rows, columns) z of the lowest point of each cell, UNOBSERVED without points."""
     lowest = np.full((rows, columns), UNOBSERVED, np.float32)
     for i in range(len(xyz)):
         x, y = np.float64(xyz[i, 0]), np.float64(xyz[i, 1])
@@ -97,17 +105,19 @@ def _lowest_points(xyz, max_range, x0, y0, scale, rows, columns):
 
 
 @njit(cache=True, nogil=True)
-def _drop_sunk(lowest, depth):
-    """Make cells UNOBSERVED whose lowest point lies deeper than those of the cells around, all but
-    one: reflections under the ground would pull the cloth down for metres around. Far away few
-    cells near have a point, so that the wider square is asked."""
+def _drop_sunk_cells(lowest, depth):
+    """Mark cells as UNOBSERVED whose lowest point is deeper than those of all cells around but one.
+
+    Reflections below the ground would pull the cloth down for metres around them. The wider window
+    is for large ranges, where few neighbouring cells have a point.
+    """
     rows, columns = lowest.shape
     sunk = []
     for r in range(rows):
         for c in range(columns):
             if lowest[r, c] == UNOBSERVED:
                 continue
-            for reach in SQUARES:
+            for reach in SUNK_WINDOWS:
                 higher = level = 0
                 for i in range(max(r - reach, 0), min(r + reach + 1, rows)):
                     for j in range(max(c - reach, 0), min(c + reach + 1, columns)):
@@ -120,7 +130,7 @@ def _drop_sunk(lowest, depth):
                         break
                 if level > 2:
                     break
-                if higher >= 4:  # the cell itself and one more are not
+                if higher >= 4:  # all but the cell itself and one more
                     sunk.append((r, c))
                     break
     for r, c in sunk:
@@ -128,9 +138,12 @@ def _drop_sunk(lowest, depth):
 
 
 @njit(cache=True, nogil=True)
-def _near_cloth(xyz, height, climbed, x0, y0, scale, max_range, threshold):
-    """(N,) bool: within max_range, and within threshold of the cloth, interpolated bilinearly, or
-    no more than that above climbed (R, C)."""
+def _select_near_cloth(xyz, height, climbed, x0, y0, scale, max_range, threshold):
+    """Select the points within max_range and within threshold of the cloth or above `climbed`.
+
+    The cloth is interpolated bilinearly; climbed (R, C) is the lowest point of the cells that
+    continue the ground, -inf elsewhere. Returns (N,) bool.
+    """
     rows, columns = height.shape
     near = np.zeros(len(xyz), np.bool_)
     for i in range(len(xyz)):

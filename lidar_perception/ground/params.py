@@ -1,4 +1,4 @@
-"""The numbers of the ground methods, and how the sensor is mounted."""
+"""Parameters of the ground methods and of the sensor's mounting."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from lidar_perception.types import SENSOR_HEIGHT
 
 @dataclass(frozen=True)
 class SensorPoseParams(Params):
-    """How the sensor is mounted. The algorithms see the levelled cloud; nothing that is published
-    moves."""
+    """Mounting of the sensor. Algorithms use a levelled copy of the cloud; published points keep
+    their coordinates."""
 
     height: float = param(SENSOR_HEIGHT, "Height of the sensor above the ground. Checked against "
                           "the first clouds; a warning gives the measured one.", unit="m",
@@ -91,7 +91,7 @@ GROUND_METHODS = ("threshold", "patchwork", "cloth")
 
 @dataclass(frozen=True)
 class GroundParams(Params):
-    """Which points are ground."""
+    """Ground segmentation."""
 
     method: str = param("threshold", "threshold: one plane (STM-CPA paper). patchwork: "
                         "Patchwork++ (EG-PointPillars paper). cloth: cloth simulation "
@@ -104,8 +104,7 @@ class GroundParams(Params):
 
 @dataclass(frozen=True)
 class ObstacleParams(Params):
-    """What of the points that are no ground is an obstacle, by its height above the ground around
-    it."""
+    """Selection of obstacles among the points that are not ground, by height above the ground."""
 
     min_height: float = param(0.0, "Obstacles are at least this high above the ground around them; "
                               "0: points below it too.", unit="m", low=0.0, high=100.0)
@@ -119,9 +118,9 @@ class ObstacleParams(Params):
                              f"{self.min_height}, or 0")
 
 
-Grounded = TypeVar("Grounded")  # a dataclass of parameters with a group ground
+P = TypeVar("P")  # a dataclass of parameters with a group `ground`
 
 
-def mounted(params: Grounded, height: float) -> Grounded:
-    """params for a sensor so many metres above the ground."""
+def set_sensor_height(params: P, height: float) -> P:
+    """Return the parameters for a sensor mounted `height` metres above the ground."""
     return with_values(params, {"ground.sensor_pose.height": height})

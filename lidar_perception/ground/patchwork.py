@@ -1,4 +1,4 @@
-"""Ground by Patchwork++ (Lee, Lim, Myung, IROS 2022), through its own library; paper B, V1."""
+"""Ground by the Patchwork++ library (Lee, Lim, Myung, IROS 2022), as in paper B's V1."""
 
 from __future__ import annotations
 
@@ -14,29 +14,38 @@ import numpy as np
 from lidar_perception.ground.params import PatchworkParams
 from lidar_perception.types import InputError
 
-_redirecting = threading.RLock()  # a caller may silence a whole run
+_stdout_lock = threading.RLock()  # reentrant, because a caller may silence a whole run
 
 
 def segment_by_patchwork(xyz: np.ndarray, intensity: np.ndarray | None, sensor_height: float,
                          params: PatchworkParams = PatchworkParams()) -> np.ndarray:
-    """(N,) bool, True = ground: of points (N, 3) float32, finite, with z up, sensor_height metres
-    above the ground. intensity (N,) float32 0..1 serves to leave out reflections; None skips that.
+    """Segment the ground of finite points.
 
-    Each cloud is judged by itself: the library's running average over clouds starts anew, so that
-    the same cloud always has the same ground. InputError where the library is not installed.
+    The library's running average over clouds is reset, so that a cloud always has the same ground.
+
+    Args:
+        xyz: (N, 3) float32 with z up.
+        intensity: (N,) float32 0..1, by which reflections are removed; None skips that.
+        sensor_height: height of the sensor above the ground in metres.
+
+    Returns:
+        (N,) bool, True = ground.
+
+    Raises:
+        InputError: if the library is not installed.
     """
     try:
         import pypatchworkpp
     except ImportError:
         raise InputError("ground.method 'patchwork' needs the package pypatchworkpp: pip install "
                          "pypatchworkpp, or choose threshold or cloth") from None
-    settings = library_settings(sensor_height, params)
+    settings = make_library_settings(sensor_height, params)
     settings.enable_RNR = params.remove_reflections and intensity is not None
     points = np.empty((len(xyz), 4), np.float32)
     points[:, :3] = xyz
     points[:, 3] = 0.0 if intensity is None else intensity
     ground = np.zeros(len(xyz), bool)
-    with silent_stdout():
+    with silence_stdout():
         engine = pypatchworkpp.patchworkpp(settings)
         if len(xyz):
             engine.estimateGround(points)
@@ -44,8 +53,8 @@ def segment_by_patchwork(xyz: np.ndarray, intensity: np.ndarray | None, sensor_h
     return ground
 
 
-def library_settings(sensor_height: float, params: PatchworkParams) -> Any:
-    """The library's own Parameters."""
+def make_library_settings(sensor_height: float, params: PatchworkParams) -> Any:
+    """Return the library's Parameters object."""
     import pypatchworkpp
     settings = pypatchworkpp.Parameters()
     settings.verbose = False
@@ -58,15 +67,15 @@ def library_settings(sensor_height: float, params: PatchworkParams) -> Any:
 
 
 @contextmanager
-def silent_stdout() -> Iterator[None]:
-    """Libraries in C++ write to file descriptor 1, where sys.stdout has no say."""
-    with _redirecting:
+def silence_stdout() -> Iterator[None]:
+    """Discard output to file descriptor 1, to which C++ libraries write without sys.stdout."""
+    with _stdout_lock:
         sys.stdout.flush()
-        kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+        saved, null = os.dup(1), os.open(os.devnull, os.O_WRONLY)
         try:
-            os.dup2(nowhere, 1)
+            os.dup2(null, 1)
             yield
         finally:
-            os.dup2(kept, 1)
-            os.close(kept)
-            os.close(nowhere)
+            os.dup2(saved, 1)
+            os.close(saved)
+            os.close(null)

@@ -1,6 +1,6 @@
 """Ground by height threshold and RANSAC plane (paper A, Sections 3.2 and 3.4).
 
-A plane is (3,) float64 [a b c]: z = a x + b y + c, in the frame of the points.
+A plane is (3,) float64 [a b c] with z = a x + b y + c, in the frame of the points.
 """
 
 from __future__ import annotations
@@ -12,57 +12,68 @@ from lidar_perception.ground.params import ThresholdParams
 from lidar_perception.types import SENSOR_HEIGHT
 
 MIN_POINTS = 3
-SAMPLE = 2048        # candidates on which trial planes are compared; the fit uses all of them
-CONFIDENCE = 0.9999  # of having drawn one triple without outliers
-MIN_SINE = 1e-3      # of the angle in a trial's triangle; a thinner one says nothing of the plane
-REFINEMENTS = 50     # the inliers settle after a few; this bounds the rare case that they cycle
+SAMPLE_SIZE = 2048    # points on which trial planes are compared; the fit uses all points
+CONFIDENCE = 0.9999   # probability of drawing at least one triple without outliers
+MIN_SINE = 1e-3       # of the angle in a trial's triangle; thinner triangles do not fix a plane
+MAX_REFINEMENTS = 50  # a few suffice; this bounds the rare case that the inliers cycle
 
 
 def segment_by_threshold(xyz: np.ndarray, params: ThresholdParams = ThresholdParams(),
                          sensor_height: float = SENSOR_HEIGHT) -> np.ndarray:
-    """(N,) bool, True = ground: points (N, 3) within inlier_distance of the plane that holds most
-    of those lower than max_height above the ground under the sensor. All False where no plane can
-    be found (too few points, all steep)."""
+    """Segment the ground of finite points (N, 3).
+
+    Returns:
+        (N,) bool, True = ground: points within inlier_distance of the plane of most points lower
+        than max_height above the ground at the sensor. All False if there is no such plane (too
+        few points, or too steep).
+    """
     plane = find_plane(xyz, params, sensor_height)
     if plane is None:
         return np.zeros(len(xyz), bool)
-    return np.abs(height_above(xyz, plane)) <= params.inlier_distance
+    return np.abs(height_above_plane(xyz, plane)) <= params.inlier_distance
 
 
 def find_plane(xyz: np.ndarray, params: ThresholdParams = ThresholdParams(),
                sensor_height: float = SENSOR_HEIGHT) -> np.ndarray | None:
-    """The plane of segment_by_threshold: found among the low points, fitted to all near it."""
+    """Find the plane of segment_by_threshold, None if there is none.
+
+    It is found among the low points and fitted to all points near it.
+    """
     low = xyz[:, 2] < params.max_height - sensor_height
-    plane = _best_of_trials(xyz.compress(low, axis=0), params)
+    plane = _run_trials(xyz.compress(low, axis=0), params)
     return None if plane is None else refine_plane(xyz, plane, params)
 
 
-def ransac_plane(xyz: np.ndarray, params: ThresholdParams) -> np.ndarray | None:
-    """The plane with most points (M, 3) within inlier_distance, then fitted to its inliers until
-    they no longer change, so that it does not depend on the triple that found it. None where
-    there is none. Fischler and Bolles, 1981, with the adaptive number of trials."""
-    plane = _best_of_trials(xyz, params)
+def fit_plane_by_ransac(xyz: np.ndarray, params: ThresholdParams) -> np.ndarray | None:
+    """Find the plane with most points (M, 3) within inlier_distance, None if there is none.
+
+    RANSAC (Fischler and Bolles, 1981) with an adaptive number of trials. The plane is then fitted
+    to its inliers until they no longer change, so that it does not depend on the triple found.
+    """
+    plane = _run_trials(xyz, params)
     return None if plane is None else refine_plane(xyz, plane, params)
 
 
-def _best_of_trials(xyz: np.ndarray, params: ThresholdParams) -> np.ndarray | None:
+def _run_trials(xyz: np.ndarray, params: ThresholdParams) -> np.ndarray | None:
     if len(xyz) < MIN_POINTS:
         return None
     rng = np.random.default_rng(params.seed)
-    sample = xyz[rng.integers(len(xyz), size=SAMPLE)] if len(xyz) > SAMPLE else xyz
+    sample = xyz[rng.integers(len(xyz), size=SAMPLE_SIZE)] if len(xyz) > SAMPLE_SIZE else xyz
     triples = rng.integers(len(sample), size=(params.max_iterations, 3))
     max_gradient = np.tan(np.radians(params.max_slope))
-    plane = _best_trial(sample.astype(np.float64), triples, params.inlier_distance, max_gradient,
-                        CONFIDENCE)
+    plane = _find_best_trial(sample.astype(np.float64), triples, params.inlier_distance,
+                             max_gradient, CONFIDENCE)
     return None if np.isnan(plane[0]) else plane
 
 
 def refine_plane(xyz: np.ndarray, plane: np.ndarray, params: ThresholdParams) -> np.ndarray | None:
-    """The plane fitted to the points (N, 3) within inlier_distance, again and again until these no
-    longer change. None where they lie on one line."""
+    """Fit a plane to the points (N, 3) within inlier_distance until these no longer change.
+
+    None if they are on one line.
+    """
     max_gradient = np.tan(np.radians(params.max_slope))
-    for _ in range(REFINEMENTS):
-        fitted = _plane_of(_moments(xyz, plane, params.inlier_distance))
+    for _ in range(MAX_REFINEMENTS):
+        fitted = _solve_plane(_compute_moments(xyz, plane, params.inlier_distance))
         if fitted is None:
             return None
         if np.array_equal(fitted, plane) or np.hypot(fitted[0], fitted[1]) > max_gradient:
@@ -72,29 +83,34 @@ def refine_plane(xyz: np.ndarray, plane: np.ndarray, params: ThresholdParams) ->
 
 
 def fit_plane(xyz: np.ndarray) -> np.ndarray | None:
-    """Least-squares plane of points (M, 3), errors along z. None for fewer than 3 points or
-    points on one line."""
-    return _plane_of(_moments(xyz, np.zeros(3), np.inf))
+    """Return the least-squares plane of points (M, 3) with errors along z.
+
+    None for fewer than 3 points or points on one line.
+    """
+    return _solve_plane(_compute_moments(xyz, np.zeros(3), np.inf))
 
 
-def inlier_share(xyz: np.ndarray, plane: np.ndarray,
-                 params: ThresholdParams = ThresholdParams()) -> float:
-    """Of the points (N, 3) lower than max_height above the plane, the share within inlier_distance
-    of it: how well one plane describes the ground. 0 where no point is that low."""
-    height = height_above(xyz, plane)
+def compute_inlier_share(xyz: np.ndarray, plane: np.ndarray,
+                         params: ThresholdParams = ThresholdParams()) -> float:
+    """Return the share of points (N, 3) below max_height that are within inlier_distance.
+
+    Both are measured from the plane. The share tells how well one plane describes the ground; it is
+    0 if no point is that low.
+    """
+    height = height_above_plane(xyz, plane)
     low = height < params.max_height
     return float((np.abs(height[low]) <= params.inlier_distance).mean()) if low.any() else 0.0
 
 
-def height_above(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """(N,) metres of points (N, 3) above the plane, along z."""
+def height_above_plane(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """Return (N,) float64 height of points (N, 3) above the plane along z, in metres."""
     x, y, z = xyz.T.astype(np.float64)  # NumPy 1 would compute in float32
     return z - (plane[0] * x + plane[1] * y + plane[2])
 
 
 @njit(cache=True)
-def _best_trial(sample, triples, distance, max_gradient, confidence):
-    """[a b c] with most inliers among planes through triples; NaN where there is none."""
+def _find_best_trial(sample, triples, distance, max_gradient, confidence):
+    """Return the plane through a triple with most inliers in the sample; NaN if there is none."""
     best, best_count = np.full(3, np.nan), 0
     needed = float(len(triples))
     for trial in range(len(triples)):
@@ -107,7 +123,7 @@ def _best_trial(sample, triples, distance, max_gradient, confidence):
         area = normal_x * normal_x + normal_y * normal_y + normal_z * normal_z
         sides = (ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz)
         if area <= MIN_SINE * MIN_SINE * sides or normal_z == 0.0:
-            continue  # three points on a line, or a vertical plane
+            continue  # points on a line, or a vertical plane
         a, b = -normal_x / normal_z, -normal_y / normal_z
         if a * a + b * b > max_gradient * max_gradient:
             continue
@@ -117,17 +133,19 @@ def _best_trial(sample, triples, distance, max_gradient, confidence):
             count += abs(sample[i, 2] - (a * sample[i, 0] + b * sample[i, 1] + c)) <= distance
         if count > best_count:
             best_count, best = count, np.array([a, b, c])
-            good = (count / len(sample)) ** 3
-            if good >= 1.0:
+            all_inliers = (count / len(sample)) ** 3  # probability for one triple
+            if all_inliers >= 1.0:
                 break
-            needed = min(needed, np.log(1 - confidence) / np.log1p(-good))
+            needed = min(needed, np.log(1 - confidence) / np.log1p(-all_inliers))
     return best
 
 
 @njit(cache=True)
-def _moments(xyz, plane, distance):
-    """Count, sums and products of the points within distance of the plane, about the first
-    point: [n, x, y, z, xx, xy, yy, xz, yz, x0, y0, z0]."""
+def _compute_moments(xyz, plane, distance):
+    """Sum the moments of the points within `distance` of the plane, relative to the first point.
+
+    Returns [n, x, y, z, xx, xy, yy, xz, yz, x0, y0, z0].
+    """
     m = np.zeros(12)
     if len(xyz) == 0:
         return m
@@ -149,7 +167,7 @@ def _moments(xyz, plane, distance):
     return m
 
 
-def _plane_of(m: np.ndarray) -> np.ndarray | None:
+def _solve_plane(m: np.ndarray) -> np.ndarray | None:
     n = m[0]
     if n < MIN_POINTS:
         return None

@@ -7,7 +7,7 @@ from typing import Any
 from lidar_perception.candidates.segmented import explain_nothing, points_in_view
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.ground.segment import segment_ground
-from lidar_perception.ground.threshold import fit_plane, inlier_share
+from lidar_perception.ground.threshold import compute_inlier_share, fit_plane
 from lidar_perception.nodes.inputs import CameraInput
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import Obstacles
@@ -56,7 +56,7 @@ class GroundSegmentation(ManagedNode):
         plane = fit_plane(seen.xyz.compress(ground, axis=0))
         if plane is not None:
             self.counts.update(plane=" ".join(f"{v:.4f}" for v in plane),
-                               plane_inlier_share=f"{inlier_share(seen.xyz, plane):.3f}",
+                               plane_inlier_share=f"{compute_inlier_share(seen.xyz, plane):.3f}",
                                ground_share=f"{ground.mean():.3f}")
         problem = explain_nothing(len(frame), ground) or self.sensor.problem(frame, params)
         self.report(WARN if problem else OK, problem or "segmenting")

@@ -11,7 +11,7 @@ from std_msgs.msg import Float64
 
 from lidar_perception.candidates.refine import Candidates
 from lidar_perception.clustering.shapes import classify_by_diagonal
-from lidar_perception.ground.above import obstacles
+from lidar_perception.ground.obstacles import find_obstacles
 from lidar_perception.nodes.runtime import CLOUD, MARKERS, OK, RELIABLE, WARN, LidarNode
 from lidar_perception.nodes.track_outputs import (
     DETECTIONS_3D,
@@ -79,7 +79,8 @@ class Obstacles:
         if self.publisher.get_subscription_count():
             placing = self.node.transforms.placing(msg.header)
             params = self.node.transforms.mounted(self.node.params, placing)
-            chosen = obstacles(xyz, ground, self.node.robot.obstacles, params.ground.sensor_pose)
+            chosen = find_obstacles(xyz, ground, self.node.robot.obstacles,
+                                    params.ground.sensor_pose)
             self.publisher.publish(encode(thin_cloud(
                 msg, placing.in_cloud(xyz.compress(chosen, axis=0)), indices.compress(chosen),
                 bag_message)))

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from lidar_perception.data.mount_check import find_height_problem, measure_sensor_height
 from lidar_perception.ground.params import SensorPoseParams
-from lidar_perception.ground.segment import height_problem, measured_height
 from lidar_perception.intensity import StreamScale
 from lidar_perception.robot.params import CropParams
 from lidar_perception.types import LidarFrame
@@ -56,10 +56,10 @@ class SensorCheck:
         if pose != self.pose:
             self.pose, self.heights = pose, []
         if len(self.heights) < CLOUDS:
-            self.heights.append(measured_height(frame.xyz, pose))
+            self.heights.append(measure_sensor_height(frame.xyz, pose))
         known = [h for h in self.heights if h is not None]
         if not known:
             return None
         height = float(np.median(known))
         self.node.counts["sensor_height"] = f"{height:.2f}"
-        return height_problem(height, pose)
+        return find_height_problem(height, pose)

@@ -14,7 +14,7 @@ from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import points_in_box
-from lidar_perception.ground.params import mounted
+from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.scoring.kitti.camera_objects import in_image
 from lidar_perception.types import (
     CLASSES,
@@ -45,7 +45,7 @@ class Labelled:
     def segmented(self, params: PipelineParams, scan: LidarFrame | None = None) -> Segmented:
         """The frame, or another scan of the same sensor, up to the boxes."""
         return segment(self.frame if scan is None else scan, self.camera,
-                       mounted(params, self.height))
+                       set_sensor_height(params, self.height))
 
 
 def load_labelled(frame: Frame) -> Labelled:

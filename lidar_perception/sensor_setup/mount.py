@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidar_perception.data.mount_check import MAX_LEAN_DEG
 from lidar_perception.ground.params import ThresholdParams
-from lidar_perception.ground.segment import MAX_LEAN
-from lidar_perception.ground.threshold import fit_plane, height_above, ransac_plane
+from lidar_perception.ground.threshold import fit_plane, fit_plane_by_ransac, height_above_plane
 from lidar_perception.robot.placing import tilted
 from lidar_perception.sensor_setup.scans import Scan
 
@@ -76,7 +76,7 @@ class Mount(NamedTuple):
     @property
     def level(self) -> bool:
         """Whether z of the sensor points up, but for as much as roads slope."""
-        return bool(self.normal[2] >= np.cos(np.radians(MAX_LEAN)))
+        return bool(self.normal[2] >= np.cos(np.radians(MAX_LEAN_DEG)))
 
 
 def ground_plane(xyz: np.ndarray, below: bool) -> Plane | None:
@@ -87,24 +87,24 @@ def ground_plane(xyz: np.ndarray, below: bool) -> Plane | None:
     candidate = side & (distance > NEAREST) & (distance < MAX_REACH)
     if candidate.sum() < MIN_POINTS:
         return None
-    plane = ransac_plane(_evened(xyz[candidate]), STEEP)
+    plane = fit_plane_by_ransac(_evened(xyz[candidate]), STEEP)
     if plane is None or (plane[2] > -MIN_HEIGHT if below else plane[2] < MIN_HEIGHT):
         return None
     # What is near says most of how the robot stands: roads fall to their curbs.
-    near = candidate & (np.abs(height_above(xyz, plane)) <= STEEP.inlier_distance)
+    near = candidate & (np.abs(height_above_plane(xyz, plane)) <= STEEP.inlier_distance)
     if near.sum() < MIN_POINTS:
         return None
     reach = np.clip(REACH * np.percentile(distance[near], 2), MIN_REACH, MAX_REACH)
     around = candidate & (distance < reach)
     for _ in range(10):
-        on = around & (np.abs(height_above(xyz, plane)) <= CLOSE)
+        on = around & (np.abs(height_above_plane(xyz, plane)) <= CLOSE)
         fitted = _evenly_fitted(xyz[on])
         if fitted is None:
             return None
         moved, plane = np.abs(fitted - plane).max(), fitted
         if moved < 1e-5:
             break
-    off = height_above(xyz, plane)
+    off = height_above_plane(xyz, plane)
     on = around & (np.abs(off) <= CLOSE)
     beyond = around & ((off < -DEEP) if below else (off > DEEP))  # under a table, not the ground
     share = on.sum() / max(1, (around & ((off if below else -off) < 1.0)).sum())

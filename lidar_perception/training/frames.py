@@ -11,8 +11,8 @@ import numpy as np
 
 from lidar_perception.data.drives import drives_of
 from lidar_perception.data.frame import BOXES, Frame, Recording
+from lidar_perception.data.mount_check import apply_measured_height, load_first_clouds
 from lidar_perception.data.open import open_recording
-from lidar_perception.ground.segment import first_clouds, mounted
 from lidar_perception.training.scenes import RecordedScenes
 from lidar_perception.types import InputError
 
@@ -80,7 +80,7 @@ def labelled_frames(path: Path, split: Path | None = None, height: float = 0.0,
 def _height(recording: Recording, height: float, mixed: bool) -> float | None:
     if height and not (mixed and recording.mounted):
         return height
-    measured = mounted(recording, first_clouds(recording))
+    measured = apply_measured_height(recording, load_first_clouds(recording))
     return None if measured is recording else next(iter(measured)).sensor_height
 
 

@@ -26,7 +26,7 @@ from lidar_perception.detectors.pointpillars.expert import draw_clusters, networ
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.detectors.view import in_sensor_frame, visible
 from lidar_perception.ground.params import SensorPoseParams
-from lidar_perception.ground.segment import level, segment_ground
+from lidar_perception.ground.segment import level_points, segment_ground
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
 
@@ -154,7 +154,7 @@ def test_another_height_of_the_sensor_moves_the_boxes_only():
 @pytest.mark.parametrize("roll, pitch", [(3.1416, 0.0), (0.0, 0.2), (0.1, -0.1)])
 def test_a_tilted_sensor_finds_the_same_boxes_in_its_own_frame(roll, pitch):
     pose = SensorPoseParams(roll=roll, pitch=pitch)
-    turn = level(np.eye(3, dtype=np.float32), pose)  # rows: the sensor's axes when level
+    turn = level_points(np.eye(3, dtype=np.float32), pose)  # rows: the sensor's axes when level
     found = Detections.of([[8, 2, -1, 4, 2, 1.5, 0.7]], scores=[0.5])
     box = in_sensor_frame(found, pose).boxes[0]
     np.testing.assert_allclose(box[:3] @ turn, [8, 2, -1], atol=1e-5)

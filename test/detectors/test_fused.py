@@ -35,7 +35,7 @@ from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, 
 from lidar_perception.detectors.pointnet import rescoring
 from lidar_perception.detectors.view import without_carrier
 from lidar_perception.geometry import bev_iou, points_in_box, points_in_boxes, wrap_angle
-from lidar_perception.ground.surface import FEWEST, surface_under
+from lidar_perception.ground.surface import MIN_POINTS, fit_ground_heights
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame
 
@@ -69,16 +69,16 @@ def test_the_ground_of_a_slope_is_the_slope(seed, along, across):
     xy = rng.uniform(-20, 20, (12000, 2))
     ground = np.column_stack([xy, xy @ [along, across] - 1.7])
     places = rng.uniform(-15, 15, (10, 2))
-    heights = surface_under(ground, places)
+    heights = fit_ground_heights(ground, places)
     np.testing.assert_allclose(heights, places @ [along, across] - 1.7, atol=1e-4)
     # Order does not matter, nor what lies elsewhere; without ground nothing is known.
-    np.testing.assert_allclose(surface_under(ground[::-1], places), heights, atol=1e-9)
+    np.testing.assert_allclose(fit_ground_heights(ground[::-1], places), heights, atol=1e-9)
     far = np.concatenate([ground, ground + [200, 0, 9]])
-    np.testing.assert_allclose(surface_under(far, places), heights, atol=1e-9)
-    assert np.isnan(surface_under(ground, places + 500)).all()
-    assert np.isnan(surface_under(ground[:FEWEST - 1], places)).all()
+    np.testing.assert_allclose(fit_ground_heights(far, places), heights, atol=1e-9)
+    assert np.isnan(fit_ground_heights(ground, places + 500)).all()
+    assert np.isnan(fit_ground_heights(ground[:MIN_POINTS - 1], places)).all()
     line = np.column_stack([np.linspace(-2, 2, 50), np.zeros(50), np.linspace(0, 9, 50)])
-    assert surface_under(line, np.array([[0, 1.0]])) == pytest.approx(line[:, 2].mean())
+    assert fit_ground_heights(line, np.array([[0, 1.0]])) == pytest.approx(line[:, 2].mean())
 
 
 def shell(box: np.ndarray, rng, count: int = 400) -> np.ndarray:

@@ -36,7 +36,7 @@ from lidar_perception.detectors.pointpillars.detector import PointPillarsDetecto
 from lidar_perception.detectors.pointpillars.network import load_network
 from lidar_perception.detectors.view import in_sensor_frame
 from lidar_perception.ground.params import SensorPoseParams
-from lidar_perception.ground.segment import level, segment_ground
+from lidar_perception.ground.segment import level_points, segment_ground
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
 
@@ -158,7 +158,7 @@ def test_a_tilted_sensor_finds_the_same_boxes_in_its_own_frame(roll, pitch, ids)
     pose = SensorPoseParams(roll=roll, pitch=pitch)
     detector, scan = random_detector(), frame()
     found = detector(scan, cluster_ids=ids).detections
-    back = level(np.eye(3, dtype=np.float32), pose).T
+    back = level_points(np.eye(3, dtype=np.float32), pose).T
     detector.params = with_values(eager(), {"ground.sensor_pose.roll": roll,
                                             "ground.sensor_pose.pitch": pitch,
                                             "pointnet.nms.iou": 1.0})

@@ -1,21 +1,25 @@
-"""Laws of the sheet under obstacles, and of the ground by cloth simulation."""
+"""Laws of the cloth solver and of ground segmentation by cloth."""
 
 from __future__ import annotations
 
-import contextlib
-import os
-
 import numpy as np
 import pytest
+from ground_samples import f1, street
 from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
 
 from lidar_perception.data.open import open_recording
-from lidar_perception.ground.climbing import REACH, STEP, UNOBSERVED, climbed_cells
 from lidar_perception.ground.cloth import lay_cloth, segment_by_cloth
-from lidar_perception.ground.obstacle import at_rest
+from lidar_perception.ground.cloth_slopes import (
+    REACH_CELLS,
+    STEP_M,
+    UNOBSERVED,
+    find_climbing_cells,
+)
+from lidar_perception.ground.cloth_solver import settle_sheet
 from lidar_perception.ground.params import ClothParams
+from lidar_perception.ground.patchwork import silence_stdout
 from lidar_perception.scoring.points.segmentation import (
     PROTOCOLS,
     ground_counts,
@@ -23,29 +27,28 @@ from lidar_perception.scoring.points.segmentation import (
     true_ground,
 )
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # other tests cover these lines
 
 
-
-def obstacles(seed, rows=24, columns=40, seen=0.6):
-    """Bumpy obstacles with unseen cells between them."""
+def make_obstacles(seed, rows=24, columns=40):
+    """Return bumpy obstacles with unobserved cells between them."""
     rng = np.random.default_rng(seed)
     heights = rng.normal(0, 0.3, (rows, columns)).astype(np.float32)
-    heights[rng.random((rows, columns)) > seen] = np.inf
+    heights[rng.random((rows, columns)) > 0.6] = np.inf
     heights[rng.random((rows, columns)) < 0.05] += np.float32(3)
     heights[0, 0] = 0
     return heights
 
 
 def free_height(sheet, obstacle, lift):
-    """Where each cell would lie without its obstacle."""
+    """Return the height that each cell would have without its obstacle."""
     wide = np.pad(sheet.astype(np.float64), 1, mode="edge")
     mean = (wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:]) / 4
     return mean + np.where(np.isfinite(obstacle), lift, 0)
 
 
-def slow_at_rest(obstacle, lift, steps=20_000):
-    """Projected Jacobi in float64, from below."""
+def settle_slowly(obstacle, lift, steps=20_000):
+    """Settle the sheet from below by projected Jacobi steps in float64."""
     sheet = np.full(obstacle.shape, obstacle.min(), np.float64)
     for _ in range(steps):
         sheet = np.minimum(free_height(sheet, obstacle, lift), obstacle)
@@ -54,8 +57,8 @@ def slow_at_rest(obstacle, lift, steps=20_000):
 
 @given(st.integers(0, 2**31), st.floats(0.0001, 0.05), st.integers(1, 4))
 def test_every_cell_touches_its_obstacle_or_hangs_free(seed, lift, levels):
-    obstacle = obstacles(seed)
-    sheet = at_rest(obstacle, lift, 1e-5, levels)
+    obstacle = make_obstacles(seed)
+    sheet = settle_sheet(obstacle, lift, 1e-5, levels)
     free = free_height(sheet, obstacle, lift)
     touches = sheet >= obstacle - 1e-6
     assert (sheet <= obstacle).all()
@@ -64,40 +67,42 @@ def test_every_cell_touches_its_obstacle_or_hangs_free(seed, lift, levels):
 
 
 @pytest.mark.parametrize("seed, lift", [(0, 0.002), (1, 0.006), (2, 0.03)])
-def test_multigrid_finds_what_slow_relaxation_finds(seed, lift):
-    obstacle = obstacles(seed, 16, 24)
-    expected = slow_at_rest(obstacle, lift)
+def test_multigrid_equals_slow_relaxation(seed, lift):
+    obstacle = make_obstacles(seed, 16, 24)
+    expected = settle_slowly(obstacle, lift)
     for levels in (1, 2, 3, 4):
-        np.testing.assert_allclose(at_rest(obstacle, lift, 1e-6, levels), expected, atol=1e-3)
+        np.testing.assert_allclose(settle_sheet(obstacle, lift, 1e-6, levels), expected, atol=1e-3)
 
 
 def climbing_road(seed=0):
-    """A road that climbs by 0.9 m from 18 to 40 m ahead and is level again, seen in rings, with
-    three cars on it that hide what is behind them."""
+    """Return a road that rises by 0.9 m between 18 and 40 m, with three cars, and its mask.
+
+    The road is sampled in rings, and the cars hide the road under them.
+    """
     rng = np.random.default_rng(seed)
     radius = 1.73 / np.tan(np.radians(np.arange(2, 24, 0.42)))
     angles = np.radians(np.arange(-60, 60, 0.17))
     reach, angle = (x.ravel() for x in np.meshgrid(radius, angles))
     x, y = reach * np.cos(angle), reach * np.sin(angle)
     cars = np.array([[15.0, 3], [26, -3], [34, 4]])
-    away = np.abs(np.stack([x, y], axis=1)[:, None] - cars) > [2.1, 0.9]
-    seen = away.any(axis=2).all(axis=1)
+    outside = np.abs(np.stack([x, y], axis=1)[:, None] - cars) > [2.1, 0.9]
+    seen = outside.any(axis=2).all(axis=1)
 
     def rise(x):
         return 0.45 * (1 - np.cos(np.clip((x - 18) / 22, 0, 1) * np.pi))
 
     road = np.column_stack([x, y, rise(x) - 1.73 + rng.normal(0, 0.01, len(x))])[seen]
-    things = [rng.uniform(-1, 1, (300, 3)) * [2, 0.85, 0.55] + [*car, rise(car[0]) - 0.9]
-              for car in cars]
-    xyz = np.concatenate([road, *things])
+    on_road = [rng.uniform(-1, 1, (300, 3)) * [2, 0.85, 0.55] + [*car, rise(car[0]) - 0.9]
+               for car in cars]
+    xyz = np.concatenate([road, *on_road])
     return xyz.astype(np.float32), np.arange(len(xyz)) < len(road)
 
 
-def test_a_road_that_climbs_stays_ground_and_the_cars_on_it_do_not_become_it():
+def test_a_climbing_road_is_ground_and_cars_on_it_are_not():
     xyz, road = climbing_road()
     found = segment_by_cloth(xyz)
     assert found[road].mean() > 0.97 and found[~road].mean() < 0.1
-    # also where reflections far below pull the cloth down
+    # The same holds where reflections far below the road pull the cloth down.
     rng = np.random.default_rng(1)
     below = rng.choice(xyz[road & (xyz[:, 0] > 12)], 12) - np.float32([0, 0, 1])
     below[:, 2] -= rng.uniform(0, 9, 12)
@@ -108,7 +113,7 @@ def test_a_road_that_climbs_stays_ground_and_the_cars_on_it_do_not_become_it():
 
 
 @given(st.integers(0, 2**31), st.floats(0.01, 0.2))
-def test_cells_are_climbed_as_a_slow_reading_climbs_them(seed, slope):
+def test_climbing_cells_equal_a_plain_implementation(seed, slope):
     rng = np.random.default_rng(seed)
     lowest = rng.uniform(0, 0.8, (14, 18)).astype(np.float32)
     lowest[rng.random(lowest.shape) < 0.4] = UNOBSERVED
@@ -119,51 +124,28 @@ def test_cells_are_climbed_as_a_slow_reading_climbs_them(seed, slope):
         new = set()
         for r, c in map(tuple, seen):
             near = sorted(((r - i) ** 2 + (c - j) ** 2, lowest[i, j]) for i, j in touched)
-            if (r, c) not in touched and near and near[0][0] <= REACH**2 and (
-                    lowest[r, c] - near[0][1] <= STEP + slope * np.sqrt(near[0][0])):
+            if (r, c) not in touched and near and near[0][0] <= REACH_CELLS**2 and (
+                    lowest[r, c] - near[0][1] <= STEP_M + slope * np.sqrt(near[0][0])):
                 new.add((r, c))
         if not new:
             break
         touched |= new
-    found = climbed_cells(lowest, height, float(np.float32(0.1)), slope)
+    found = find_climbing_cells(lowest, height, float(np.float32(0.1)), slope)
     assert {tuple(cell) for cell in np.argwhere(found)} == {
         (r, c) for r, c in touched if lowest[r, c] > np.float32(0.1)}
 
 
 @given(st.integers(0, 2**31))
 def test_a_higher_obstacle_never_lowers_the_sheet(seed):
-    obstacle = obstacles(seed)
+    obstacle = make_obstacles(seed)
     higher = obstacle.copy()
     higher[5:9, 5:9] += np.float32(1)
-    low, high = (at_rest(o, 0.01, 1e-5, 4) for o in (obstacle, higher))
+    low, high = (settle_sheet(o, 0.01, 1e-5, 4) for o in (obstacle, higher))
     assert (high >= low - 2e-4).all()
 
 
-def street(seed=0, slope=(0.0, 0.0), count=30_000, reach=40.0):
-    """Points of a sloped road, five cars and a wall on it; and which of them are the road's."""
-    rng = np.random.default_rng(seed)
-    road = np.column_stack([rng.uniform(-reach, reach, (count, 2)), rng.normal(0, 0.02, count)])
-    cars = [rng.uniform(-1, 1, (600, 3)) * [2.1, 0.9, 0.6] + [*rng.uniform(-25, 25, 2), 0.9]
-            for _ in range(5)]
-    wall = np.column_stack([rng.uniform(-30, 30, 3000), np.full(3000, 33.25),
-                            rng.uniform(0.4, 5, 3000)])
-    # Nothing is seen of the road behind the wall or under the cars.
-    hidden = road[:, 1] > 33
-    for car in cars:
-        centre = car.mean(axis=0)
-        hidden |= (np.abs(road[:, :2] - centre[:2]) < [2.1, 0.9]).all(axis=1)
-    road = road[~hidden]
-    xyz = np.concatenate([road, *cars, wall])
-    xyz[:, 2] += xyz[:, :2] @ np.asarray(slope) - 1.73
-    return xyz.astype(np.float32), np.arange(len(xyz)) < len(road)
-
-
-def f1(found, truth):
-    return 2 * (found & truth).sum() / (found.sum() + truth.sum())
-
-
 @pytest.mark.parametrize("slope", [(0, 0), (0.1, -0.05), (-0.2, 0.15)])
-def test_a_road_is_ground_and_what_stands_on_it_is_not(slope):
+def test_a_sloped_road_is_ground_and_objects_are_not(slope):
     xyz, road = street(slope=slope)
     assert f1(segment_by_cloth(xyz), road) > 0.985
 
@@ -196,13 +178,13 @@ def test_rotating_about_z_rotates_the_ground(degrees, same):
 
 @pytest.mark.parametrize("far", [[1e5, 0, 0], [0, -9e4, 50], [0, 101, -1.7], [95, 80, 30],
                                  [-99, 3, -8]])
-def test_a_far_outlier_changes_nothing_near(far):
+def test_a_far_outlier_does_not_change_the_ground(far):
     xyz, _ = street(4)
     found = segment_by_cloth(np.concatenate([xyz, np.float32([far])]))[:-1]
     assert (found != segment_by_cloth(xyz)).mean() < 1e-3
 
 
-def test_reflections_below_the_ground_pull_nothing_down():
+def test_reflections_below_the_ground_do_not_move_it():
     xyz, _ = street(5)
     below = np.column_stack([np.random.default_rng(0).uniform(-30, 30, (40, 2)),
                              np.full(40, -4.0)]).astype(np.float32)
@@ -211,7 +193,7 @@ def test_reflections_below_the_ground_pull_nothing_down():
     assert (found[:-40] != segment_by_cloth(xyz)).mean() < 0.002
 
 
-def test_points_beyond_max_range_are_not_ground_and_do_not_make_the_cloth_larger():
+def test_points_beyond_max_range_are_ignored():
     xyz, road = street(6)
     params = ClothParams(max_range=15)
     inside = (np.abs(xyz[:, :2]) <= 15).all(axis=1)
@@ -226,48 +208,35 @@ def test_points_beyond_max_range_are_not_ground_and_do_not_make_the_cloth_larger
     (np.full((9, 3), 3.3), [True] * 9),
     ([[1, 1, -2], [1, 1, -1.9], [1, 1, 4]], [True, True, False]),
 ], ids=["empty", "one point", "far", "all equal", "column"])
-def test_small_clouds(xyz, expected):
+def test_small_clouds_are_segmented(xyz, expected):
     found = segment_by_cloth(np.asarray(xyz, np.float32).reshape(-1, 3))
     assert found.dtype == bool and found.tolist() == expected
 
 
-def test_a_finer_cloth_sees_the_same_street():
+def test_resolution_of_the_cloth_hardly_matters():
     xyz, road = street(7, count=120_000)
     for resolution in (0.3, 0.5, 1.0):
         assert f1(segment_by_cloth(xyz, ClothParams(resolution=resolution)), road) > 0.985
 
 
-@contextlib.contextmanager
-def silent():
-    """The wheel prints to file descriptor 1."""
-    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    try:
-        yield
-    finally:
-        os.dup2(kept, 1)
-        os.close(kept)
-        os.close(nowhere)
-
-
 @needs_data
-def test_on_the_real_scan_it_is_as_good_as_the_falling_cloth_of_the_wheel():
+def test_a_real_scan_is_segmented_as_well_as_by_csf():
     CSF = pytest.importorskip("CSF")
     labelled = open_recording(DATA / "semantickitti").frames[0]
     frame, semantic = labelled.load(), labelled.point_truth().classes
     params = ClothParams()
-    with silent():
-        wheel = CSF.CSF()
-        wheel.params.bSloopSmooth = False
-        wheel.params.cloth_resolution = params.resolution
-        wheel.params.class_threshold = params.class_threshold
-        wheel.setPointCloud(frame.xyz.astype(np.float64))
+    with silence_stdout():
+        peer = CSF.CSF()
+        peer.params.bSloopSmooth = False
+        peer.params.cloth_resolution = params.resolution
+        peer.params.class_threshold = params.class_threshold
+        peer.setPointCloud(frame.xyz.astype(np.float64))
         inside, outside = CSF.VecInt(), CSF.VecInt()
-        wheel.do_filtering(inside, outside, False)
+        peer.do_filtering(inside, outside, False)
     theirs = np.zeros(len(frame), bool)
     theirs[np.array(inside)] = True
     ours = segment_by_cloth(frame.xyz, params)
     for protocol in PROTOCOLS:
         truth = true_ground(semantic, frame.xyz[:, 2], protocol)
-        mine, his = (ground_row(ground_counts(g, *truth))["f1"] for g in (ours, theirs))
-        assert mine > his - 0.01 and mine > 0.95, protocol
+        our_f1, their_f1 = (ground_row(ground_counts(g, *truth))["f1"] for g in (ours, theirs))
+        assert our_f1 > their_f1 - 0.01 and our_f1 > 0.95, protocol

@@ -18,7 +18,7 @@ from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, Reliabilit
 from rclpy.qos import qos_check_compatible as compatible
 
 from lidar_perception.data.bag import Bag
-from lidar_perception.ground.above import obstacles
+from lidar_perception.ground.obstacles import find_obstacles
 from lidar_perception.ground.params import ObstacleParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.nodes import NODES
@@ -156,7 +156,7 @@ def test_a_costmap_gets_the_obstacles_of_each_cloud(processes, peer, drive_bag):
     peer.send(talker, cloud, lambda: all(heard.values()), "obstacles of both")
     frame, indices = to_frame(cloud)
     ground = segment_ground(frame)
-    chosen = obstacles(frame.xyz, ground, ObstacleParams(0.2, 2.5))
+    chosen = find_obstacles(frame.xyz, ground, ObstacleParams(0.2, 2.5))
     assert 0 < chosen.sum() < (~ground).sum()
     sent = to_array(cloud)[indices[chosen]]
     for message, *_ in heard.values():

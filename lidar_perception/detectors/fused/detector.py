@@ -37,7 +37,7 @@ from lidar_perception.detectors.view import (
 )
 from lidar_perception.geometry import bev_iou, centre_distances
 from lidar_perception.ground.params import SensorPoseParams
-from lidar_perception.ground.surface import surface_under
+from lidar_perception.ground.surface import fit_ground_heights
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, LidarFrame
 
 
@@ -166,7 +166,7 @@ class FusedDetector(NetworkDetector):
                 name: float(every.scores[every.class_ids == CLASSES.index(name)].max(initial=0.0))
                 for name in self.classes}
         boxes = cars_on_points(found.boxes, found.class_ids, look.xyz, settings.on_points)
-        floors = surface_under(look.ground, boxes[:, :2])
+        floors = fit_ground_heights(look.ground, boxes[:, :2])
         moved = replace(found, boxes=on_ground(boxes, floors, settings.on_ground).astype(
             np.float32))
         return moved[one_of_each(moved, settings)], {}

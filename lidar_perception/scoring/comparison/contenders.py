@@ -25,7 +25,7 @@ from lidar_perception.detectors.pointnet.weights_file import weights_file as poi
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file as pointpillars_file
-from lidar_perception.ground.params import mounted
+from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.report import pedestrians_of
 from lidar_perception.scoring.comparison.outcomes import Contender
@@ -107,8 +107,8 @@ def contenders(weights: Sequence[Path] = (), device: str = "auto",
         found.append(always(FUSED, opened_as(FUSED), "those of PointPillars and PointNet"))
     except InputError as error:
         missing.append(Missing(FUSED, str(error)))
-    paper, best = (with_values(mounted(params, sensor_height), settings.get(CANDIDATES, {}))
-                   for params in (PAPER, BEST))
+    paper, best = (with_values(set_sensor_height(params, sensor_height),
+                               settings.get(CANDIDATES, {})) for params in (PAPER, BEST))
     return [*_candidates(paper, best), *found], missing
 
 

@@ -1,11 +1,11 @@
-"""A loaded sheet under obstacles, at rest: the obstacle problem on a grid, by multigrid.
+"""Multigrid solver of the obstacle problem: a loaded sheet at rest under obstacles.
 
-Of a grid (R, C) of heights, each obeys height <= obstacle, and either touches its obstacle or lies
-at the mean of its four neighbours plus its lift. At the border the sheet goes on level. One smooth
-pass moves only near neighbours; a coarser grid moves what is far, and so a few cycles suffice
-(Brandt and Cryer, SIAM J. Sci. Stat. Comput. 4(4), 1983).
+Each height of a grid (R, C) obeys height <= obstacle, and either touches its obstacle or is at the
+mean of its four neighbours plus its lift. Beyond the border the sheet is level. A smoothing pass
+moves near neighbours only, but coarser grids move distant cells, so a few cycles suffice (Brandt
+and Cryer, SIAM J. Sci. Stat. Comput. 4(4), 1983).
 
-Arrays here have a border of one cell all around. "Unobserved" cells have no obstacle (inf).
+Arrays in this module have a border of one cell. "Unobserved" cells have no obstacle (inf).
 """
 
 from __future__ import annotations
@@ -14,18 +14,21 @@ import numpy as np
 from numba import njit
 
 SWEEPS = 2            # before and after each correction
-COARSEST_SWEEPS = 40  # of the coarsest grid, some ten cells wide
-RELAXATION = 1.5      # over-relaxation there
-MAX_CYCLES = 30       # five to seven are the rule
+COARSEST_SWEEPS = 40  # on the coarsest grid, which is about ten cells wide
+RELAXATION = 1.5      # over-relaxation on the coarsest grid
+MAX_CYCLES = 30       # five to seven are typical
 
 
-def at_rest(obstacle: np.ndarray, lift: float, tolerance: float, levels: int) -> np.ndarray:
-    """(R, C) float32 heights of the sheet under obstacle (R, C) float32, inf where there is none;
-    R and C are multiples of 2 ** (levels - 1), and something is finite.
+def settle_sheet(obstacle: np.ndarray, lift: float, tolerance: float, levels: int) -> np.ndarray:
+    """Return the heights (R, C) float32 of the sheet at rest.
 
-    lift: metres that the load raises a free cell over the mean of its neighbours; cells without an
-    obstacle are not loaded, so that between its rims an unobserved area stays straight. The result
-    is settled when a sweep moves no observed cell by more than tolerance, in metres.
+    Args:
+        obstacle: (R, C) float32, inf where there is none, with at least one finite value; R and C
+            are multiples of 2 ** (levels - 1).
+        lift: metres by which the load raises a free cell above the mean of its neighbours. Cells
+            without an obstacle are not loaded, so that the sheet is straight across them.
+        tolerance: the sheet is at rest when a sweep moves no observed cell farther, in metres.
+        levels: number of grids.
     """
     obstacles = [obstacle]
     while len(obstacles) < levels:
@@ -38,41 +41,46 @@ def at_rest(obstacle: np.ndarray, lift: float, tolerance: float, levels: int) ->
         if level == levels - 1:
             sheet = np.minimum(np.float32(obstacles[-1].min()), above)
         else:
-            sheet = _refined(sheet, above)
+            sheet = _refine(sheet, above)
         for _ in range(MAX_CYCLES if level == 0 else 2):
-            if _cycle(sheet, above, loads, levels - 1 - level) <= tolerance:
+            if _run_cycle(sheet, above, loads, levels - 1 - level) <= tolerance:
                 break
     return sheet[1:-1, 1:-1].copy()
 
 
-def _cycle(sheet: np.ndarray, above: np.ndarray, lift: np.ndarray, coarser: int) -> float:
-    """One V-cycle, in place, with so many coarser grids; how far the last sweep moved a cell."""
+def _run_cycle(sheet: np.ndarray, above: np.ndarray, lift: np.ndarray, coarser: int) -> float:
+    """Run one V-cycle in place; return how far the last sweep moved a cell, in metres.
+
+    coarser is the number of coarser grids.
+    """
     if coarser == 0:
         return _smooth(sheet, above, lift, COARSEST_SWEEPS, np.float32(RELAXATION))
     _smooth(sheet, above, lift, SWEEPS, np.float32(1.0))
-    gap, rest = _remaining(sheet, above, lift)
+    gap, rest = _restrict_residual(sheet, above, lift)
     correction = np.zeros_like(gap)
-    _cycle(correction, gap, rest, coarser - 1)
-    _add_finer(correction, sheet, above)
+    _run_cycle(correction, gap, rest, coarser - 1)
+    _add_correction(correction, sheet, above)
     return _smooth(sheet, above, lift, SWEEPS, np.float32(1.0))
 
 
-def _refined(sheet: np.ndarray, above: np.ndarray) -> np.ndarray:
+def _refine(sheet: np.ndarray, above: np.ndarray) -> np.ndarray:
     finer = np.zeros_like(above)
-    _add_finer(sheet, finer, above)
+    _add_correction(sheet, finer, above)
     return finer
 
 
 @njit(cache=True, nogil=True)
 def _smooth(sheet, above, lift, sweeps, relaxation):
-    """Projected Gauss-Seidel in red and black order; how far the last sweep moved an observed
-    cell."""
+    """Smooth by projected Gauss-Seidel in red-black order.
+
+    Return how far the last sweep moved an observed cell, in metres.
+    """
     rows, columns = sheet.shape
     quarter, moved = np.float32(0.25), np.float32(0.0)
     for _ in range(sweeps):
         moved = np.float32(0.0)
         for colour in range(2):
-            _continue_level(sheet)
+            _extend_border(sheet)
             for r in range(1, rows - 1):
                 for c in range(1 + (r + colour) % 2, columns - 1, 2):
                     old = sheet[r, c]
@@ -82,12 +90,12 @@ def _smooth(sheet, above, lift, sweeps, relaxation):
                     if above[r, c] < np.inf:
                         moved = max(moved, abs(new - old))
                     sheet[r, c] = new
-    _continue_level(sheet)
+    _extend_border(sheet)
     return moved
 
 
 @njit(cache=True, nogil=True)
-def _continue_level(sheet):
+def _extend_border(sheet):
     rows, columns = sheet.shape
     for c in range(columns):
         sheet[0, c], sheet[rows - 1, c] = sheet[1, c], sheet[rows - 2, c]
@@ -96,9 +104,11 @@ def _continue_level(sheet):
 
 
 @njit(cache=True, nogil=True)
-def _remaining(sheet, above, lift):
-    """The problem of the correction on the next coarser grid: how far each four cells may rise
-    at most, and what is left to lift them. Cells that are pressed to their obstacle press on."""
+def _restrict_residual(sheet, above, lift):
+    """Return the correction's problem on the next coarser grid: its obstacle and its lift.
+
+    The obstacle is the smallest gap of each four cells; the lift is the sum of their residuals.
+    """
     rows, columns = (sheet.shape[0] - 2) // 2, (sheet.shape[1] - 2) // 2
     gap = np.full((rows + 2, columns + 2), np.inf, np.float32)
     rest = np.zeros((rows + 2, columns + 2), np.float32)
@@ -116,10 +126,10 @@ def _remaining(sheet, above, lift):
 
 
 @njit(cache=True, nogil=True)
-def _add_finer(coarse, sheet, above):
-    """sheet += coarse, interpolated bilinearly, as far as the obstacles above allow."""
+def _add_correction(coarse, sheet, above):
+    """Add coarse, interpolated bilinearly, to the sheet, up to the obstacles `above`."""
     rows, columns = sheet.shape
-    _continue_level(coarse)
+    _extend_border(coarse)
     near, side, far = np.float32(9 / 16), np.float32(3 / 16), np.float32(1 / 16)
     for i in range(1, rows - 1):
         r = (i + 1) // 2

@@ -1,5 +1,4 @@
-"""Laws of the ground plane: found under noise and outliers, a fixed point, None where there is
-none."""
+"""Laws of the ground plane: robust to noise and outliers, a fixed point of fitting."""
 
 from __future__ import annotations
 
@@ -14,8 +13,8 @@ from lidar_perception.ground.params import ThresholdParams
 from lidar_perception.ground.threshold import (
     find_plane,
     fit_plane,
-    height_above,
-    ransac_plane,
+    fit_plane_by_ransac,
+    height_above_plane,
     segment_by_threshold,
 )
 
@@ -23,24 +22,24 @@ SCANS = DATA / "kitti_object/training/velodyne"
 slopes = st.floats(-0.15, 0.15)
 
 
-def sloped_scene(seed, plane, count=3000, outliers=0.4, noise=0.02, high=4.0):
-    """Noisy points of the plane within 20 m, and outliers up to `high` m above it; shuffled."""
+def sloped_scene(seed, plane, count=3000, outliers=0.4, noise=0.02, max_outlier=4.0):
+    """Return noisy points of the plane within 20 m, and outliers up to max_outlier m above it."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-20, 20, (count, 2))
     z = xy @ plane[:2] + plane[2] + rng.normal(0, noise, count)
     stray = rng.random(count) < outliers
-    z[stray] += rng.uniform(0.3, high, stray.sum())
+    z[stray] += rng.uniform(0.3, max_outlier, stray.sum())
     return np.column_stack([xy, z]).astype(np.float32)
 
 
 def angle_between(p, q):
-    """Degrees between the normals of two planes."""
+    """Return the angle between the normals of two planes, in degrees."""
     n, m = (np.array([-a[0], -a[1], 1.0]) for a in (p, q))
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(n, m)), n @ m))
 
 
-def apart(p, q, reach=20.0):
-    """Largest distance along z of two planes within a square of 2 reach."""
+def max_distance(p, q, reach=20.0):
+    """Return the largest distance along z of two planes for |x|, |y| <= reach."""
     return abs(p[2] - q[2]) + reach * (abs(p[0] - q[0]) + abs(p[1] - q[1]))
 
 
@@ -51,17 +50,16 @@ def real_scans(*numbers):
 
 
 @given(st.integers(0, 2**31), slopes, slopes, st.floats(-3, -1.3))
-def test_the_plane_is_within_1_cm_and_a_tenth_degree_under_40_percent_outliers(seed, a, b, c):
+def test_the_plane_is_accurate_with_40_percent_outliers(seed, a, b, c):
     true = np.array([a, b, c])
     xyz = sloped_scene(seed, true)
-    found = ransac_plane(xyz, ThresholdParams(max_height=100.0))
+    found = fit_plane_by_ransac(xyz, ThresholdParams(max_height=100.0))
     assert angle_between(found, true) < 0.1
-    assert abs(height_above(np.zeros((1, 3)), found)[0] - height_above(np.zeros((1, 3)), true)[0]
-               ) < 0.01
+    assert abs(found[2] - true[2]) < 0.01
 
 
 @given(st.integers(0, 2**31), slopes, slopes)
-def test_ground_is_every_candidate_within_inlier_distance_of_the_plane(seed, a, b):
+def test_ground_is_every_point_within_inlier_distance(seed, a, b):
     xyz = sloped_scene(seed, [a, b, -1.7])
     params = ThresholdParams(max_height=0.73, inlier_distance=0.07)
     plane = find_plane(xyz, params, sensor_height=1.73)
@@ -72,16 +70,16 @@ def test_ground_is_every_candidate_within_inlier_distance_of_the_plane(seed, a, 
 
 
 @given(st.integers(0, 2**31), slopes, slopes, st.sampled_from([0.0, 300.0, 5000.0]))
-def test_the_plane_is_a_fixed_point_of_fitting_the_ground(seed, a, b, offset):
+def test_the_plane_is_a_fixed_point_of_fitting(seed, a, b, offset):
     xyz = sloped_scene(seed, [a, b, -1.7])
     xyz[:, 0] += np.float32(offset)
     params = ThresholdParams(max_height=100.0)
-    plane = ransac_plane(xyz, params)
-    again = fit_plane(xyz[segment_by_threshold(xyz, params)])
-    np.testing.assert_allclose(again[:2], plane[:2], rtol=0, atol=1e-9)
-    here = np.array([[offset, 0.0, 0.0]])
-    np.testing.assert_allclose(height_above(here, again), height_above(here, plane), rtol=0,
-                               atol=1e-9)
+    plane = fit_plane_by_ransac(xyz, params)
+    refitted = fit_plane(xyz[segment_by_threshold(xyz, params)])
+    np.testing.assert_allclose(refitted[:2], plane[:2], rtol=0, atol=1e-9)
+    origin = np.array([[offset, 0.0, 0.0]])
+    np.testing.assert_allclose(height_above_plane(origin, refitted),
+                               height_above_plane(origin, plane), rtol=0, atol=1e-9)
 
 
 @given(st.integers(0, 2**31), slopes, slopes)
@@ -94,7 +92,7 @@ def test_permuting_points_permutes_the_ground(seed, a, b):
 
 
 @given(st.integers(0, 2**31), slopes, slopes)
-def test_fit_plane_is_numpys_least_squares(seed, a, b):
+def test_fit_plane_equals_numpy_least_squares(seed, a, b):
     xyz = sloped_scene(seed, [a, b, -1.7], count=50).astype(np.float64)
     design = np.column_stack([xyz[:, :2], np.ones(len(xyz))])
     np.testing.assert_allclose(fit_plane(xyz), np.linalg.lstsq(design, xyz[:, 2], rcond=None)[0],
@@ -103,7 +101,7 @@ def test_fit_plane_is_numpys_least_squares(seed, a, b):
 
 @needs_data
 @pytest.mark.parametrize("scan", [0, 5, 13, 20])
-def test_on_real_clouds_the_plane_is_that_of_2000_trials_of_sklearn(scan):
+def test_plane_of_a_real_cloud_equals_sklearn_ransac(scan):
     xyz, = real_scans(scan)
     params = ThresholdParams()
     low = xyz[xyz[:, 2] < -1.3]
@@ -112,18 +110,18 @@ def test_on_real_clouds_the_plane_is_that_of_2000_trials_of_sklearn(scan):
     sample = np.random.default_rng(0).permutation(len(low))[:5000]  # 2000 trials on all are slow
     model.fit(low[sample, :2].astype(float), low[sample, 2].astype(float))
     plane = np.array([*model.estimator_.coef_, model.estimator_.intercept_])
-    for _ in range(100):  # to the fixed point on all points, as ours
-        near = np.abs(height_above(low, plane)) <= params.inlier_distance
+    for _ in range(100):  # refine to the fixed point on all points, as ours does
+        near = np.abs(height_above_plane(low, plane)) <= params.inlier_distance
         plane, before = fit_plane(low[near]), plane
         if np.array_equal(plane, before):
             break
-    found = ransac_plane(low, params)
+    found = fit_plane_by_ransac(low, params)
     assert angle_between(found, plane) < 0.1
     assert abs(found[2] - plane[2]) < 0.01
 
 
 @needs_data
-def test_on_real_clouds_the_plane_is_a_fixed_point_and_not_a_matter_of_order_or_seed():
+def test_plane_of_a_real_cloud_ignores_order_and_seed():
     for xyz in real_scans(2, 9):
         params = ThresholdParams()
         ground = segment_by_threshold(xyz, params)
@@ -133,7 +131,7 @@ def test_on_real_clouds_the_plane_is_a_fixed_point_and_not_a_matter_of_order_or_
         for other in (segment_by_threshold(xyz, ThresholdParams(seed=5)),
                       segment_by_threshold(xyz[order], params)[np.argsort(order)]):
             assert (other != ground).mean() < 0.01
-            assert apart(fit_plane(xyz[other]), plane) < 0.05
+            assert max_distance(fit_plane(xyz[other]), plane) < 0.05
 
 
 def wall(count=400):
@@ -142,7 +140,8 @@ def wall(count=400):
                             rng.uniform(-4, -1.4, count)])
 
 
-upside_down = sloped_scene(0, np.array([0.01, 0, -1.73]), high=2.5) * np.float32([1, -1, -1])
+upside_down = sloped_scene(0, np.array([0.01, 0, -1.73]),
+                           max_outlier=2.5) * np.float32([1, -1, -1])
 
 
 @pytest.mark.parametrize("xyz", [
@@ -158,14 +157,14 @@ upside_down = sloped_scene(0, np.array([0.01, 0, -1.73]), high=2.5) * np.float32
     upside_down,
 ], ids=["empty", "one point", "two points", "all equal", "line", "slanted line", "pole", "wall",
         "all above max_height", "upside-down sensor"])
-def test_where_there_is_no_ground_nothing_is(xyz):
+def test_clouds_without_ground_give_an_empty_mask(xyz):
     ground = segment_by_threshold(xyz.astype(np.float32))
     assert ground.shape == (len(xyz),) and ground.dtype == bool and not ground.any()
 
 
 def test_three_points_are_enough_for_a_plane():
     xyz = np.float32([[0, 0, -2], [4, 0, -2.5], [0, 4, -1.75]])
-    np.testing.assert_allclose(ransac_plane(xyz, ThresholdParams()), [-0.125, 0.0625, -2],
+    np.testing.assert_allclose(fit_plane_by_ransac(xyz, ThresholdParams()), [-0.125, 0.0625, -2],
                                atol=1e-9)
     assert segment_by_threshold(xyz).all()
 
@@ -183,17 +182,17 @@ def test_a_plane_steeper_than_max_slope_is_not_ground():
     assert not segment_by_threshold(steep, ThresholdParams(max_slope=5.0, max_height=5.0)).any()
 
 
-def test_the_ground_goes_on_where_the_road_climbs_above_max_height():
-    # 12 degrees: 4 m up at 20 m, where a plain threshold would end after 2 m.
+def test_ground_continues_where_the_road_rises_above_max_height():
+    # 12 degrees: 4 m up at 20 m; a threshold on z would end after 2 m.
     xyz = sloped_scene(2, [0.2, 0, -1.73], outliers=0.3)
-    on_plane = np.abs(height_above(xyz, np.array([0.2, 0, -1.73]))) < 0.05
+    on_plane = np.abs(height_above_plane(xyz, np.array([0.2, 0, -1.73]))) < 0.05
     ground = segment_by_threshold(xyz)
     assert ground[on_plane].mean() > 0.99 and ground[xyz[:, 0] > 10].sum() > 400
     assert ground.sum() < 1.1 * on_plane.sum()
 
 
 def test_max_height_counts_from_the_ground_under_the_sensor():
-    """A second, larger plane 0.5 m higher: seen only if max_height reaches it."""
+    """A second, larger plane 0.5 m higher counts only if max_height reaches it."""
     rng = np.random.default_rng(0)
     floor, table = (np.column_stack([rng.uniform(-9, 9, (n, 2)), np.full(n, z)]).astype(np.float32)
                     for n, z in ((300, -0.7), (900, -0.2)))
@@ -203,7 +202,7 @@ def test_max_height_counts_from_the_ground_under_the_sensor():
         np.testing.assert_allclose(plane, [0, 0, expected], atol=1e-6)
 
 
-def test_same_seed_same_ground_and_the_input_stays_unchanged():
+def test_the_result_is_repeatable_and_the_input_not_modified():
     xyz = sloped_scene(3, [0.05, 0.02, -1.8])
     before = xyz.copy()
     first = segment_by_threshold(xyz)

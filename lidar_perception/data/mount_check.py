@@ -1,0 +1,110 @@
+"""Check of a sensor's mounting: its height and lean, measured from the ground in its clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import islice
+
+import numpy as np
+
+from lidar_perception.data.frame import Recording
+from lidar_perception.ground.params import SensorPoseParams, ThresholdParams
+from lidar_perception.ground.segment import level_points
+from lidar_perception.ground.threshold import fit_plane_by_ransac
+from lidar_perception.types import SENSOR_HEIGHT, InputError, LidarFrame
+
+# The floor is fitted beyond the vehicle, and near enough for one plane.
+MIN_RANGE_M, MAX_RANGE_M = 2.5, 25.0
+FLOOR_PLANE = ThresholdParams(max_slope=15.0)
+STEEP_FLOOR_PLANE = ThresholdParams(max_slope=30.0)  # for a sensor that leans
+MIN_FLOOR_SHARE = 0.15      # minimum share of the points that must be on the plane
+FIRST_CLOUDS = 3            # number of clouds of a recording that are checked
+HEIGHT_TOLERANCE_M = 0.25   # between the parameter and the measured height
+MAX_LEAN_DEG = 5.0          # roads slope as much
+
+
+def measure_sensor_height(xyz: np.ndarray,
+                          pose: SensorPoseParams = SensorPoseParams()) -> float | None:
+    """Return the height of the sensor above the plane of most of the points (N, 3) around it.
+
+    The height is in metres, and negative for a plane overhead, as of a sensor mounted upside down.
+    None if there is no such plane.
+    """
+    plane = _find_floor(level_points(xyz, pose))
+    return None if plane is None else -float(plane[2])
+
+
+def find_height_problem(measured: float | None, pose: SensorPoseParams) -> str | None:
+    """Describe how a measured height contradicts sensor_pose, with the remedy; None if it fits."""
+    if measured is None or abs(measured - pose.height) <= HEIGHT_TOLERANCE_M:
+        return None
+    if measured < 0:
+        return (f"the ground seems to be {-measured:.2f} m above the sensor; if it is mounted "
+                "upside down, set ground.sensor_pose.roll to 3.1416")
+    return (f"the sensor is {measured:.2f} m above the ground but ground.sensor_pose.height is "
+            f"{pose.height:g}; set it to {measured:.2f}")
+
+
+def load_first_clouds(recording: Recording) -> list[LidarFrame]:
+    """Load the clouds that the check of a recording needs.
+
+    The list is empty if one of them cannot be read: the caller that needs it reports the error.
+    """
+    try:
+        return [frame.load() for frame in islice(recording, FIRST_CLOUDS)]
+    except InputError:
+        return []
+
+
+def apply_measured_height(recording: Recording, clouds: Sequence[LidarFrame]) -> Recording:
+    """Reopen a recording with the sensor height that its first clouds show.
+
+    The recording itself is returned if it states the height, if its clouds disagree, or if the
+    height is about KITTI's.
+    """
+    if recording.mounted or recording.reopen is None:
+        return recording
+    heights = -_find_floors(clouds)[:, 2]
+    if not len(heights) or np.ptp(heights) > HEIGHT_TOLERANCE_M:
+        return recording
+    height = round(float(np.median(heights)), 2)
+    if height < 0 or abs(height - SENSOR_HEIGHT) <= HEIGHT_TOLERANCE_M:
+        return recording
+    return recording.reopen(sensor_height=height)
+
+
+def find_mount_problem(recording: Recording, clouds: Sequence[LidarFrame]) -> str | None:
+    """Describe a sensor that leans or is upside down, by the first clouds, with the remedy.
+
+    None if the sensor is level, or if fewer than two clouds show a floor.
+    """
+    floors = _find_floors(clouds, STEEP_FLOOR_PLANE)
+    if len(floors) < 2:
+        return None
+    height = -float(np.median(floors[:, 2]))
+    lean = float(np.median(np.degrees(np.arctan(np.hypot(*floors[:, :2].T)))))
+    if height >= 0 and lean <= MAX_LEAN_DEG:
+        return None
+    finding = (f"its sensor leans by {lean:.0f} degrees against the ground" if height >= 0 else
+               f"the ground seems to be {-height:.2f} m above its sensor: it is upside down")
+    return (f"{finding}, where detectors take z as up; measure it with setup, and make a level bag "
+            f"with convert {recording.path} --robot robot/robot.param.yaml --out level.bag")
+
+
+def _find_floor(xyz: np.ndarray, params: ThresholdParams = FLOOR_PLANE) -> np.ndarray | None:
+    """Return the plane z = a x + b y + c, (3,), of most of the points (N, 3) around the sensor."""
+    square = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
+    near = xyz.compress((square >= MIN_RANGE_M**2) & (square <= MAX_RANGE_M**2), axis=0)
+    plane = fit_plane_by_ransac(near, params)
+    if plane is None:
+        return None
+    x, y, z = near.T
+    on_plane = np.abs(z - (plane[0] * x + plane[1] * y + plane[2])) <= params.inlier_distance
+    return plane if on_plane.mean() >= MIN_FLOOR_SHARE else None
+
+
+def _find_floors(clouds: Sequence[LidarFrame],
+                 params: ThresholdParams = FLOOR_PLANE) -> np.ndarray:
+    """Return the planes (K, 3) of the clouds that have a floor."""
+    return np.array([plane for cloud in clouds if len(cloud)
+                     if (plane := _find_floor(cloud.xyz, params)) is not None]).reshape(-1, 3)
