@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import field, fields
 from typing import Any
 
-from lidar_perception.types import did_you_mean
+from lidar_perception.types import did_you_mean, valid_names
 
 MAX_INT = 2**31 - 1
 SHOWN = reprlib.Repr()  # of a value that is refused, as much as fits into a line
@@ -125,7 +125,7 @@ def with_values(params: Any, values: Mapping[str, Any]) -> Any:
     or wrong."""
     known = parameter_fields(params)
     if unknown := [name for name in values if name not in known]:
-        raise ValueError(f"unknown parameter {unknown[0]!r}; known are {', '.join(known)}")
+        raise ValueError(f"unknown parameter {unknown[0]!r}{valid_names(unknown[0], known)}")
     return _replaced(params, values, "")
 
 

@@ -106,7 +106,8 @@ def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: i
     values, = settings.values(_runs(detector))
     if detector == CANDIDATES and (range != "auto" or device != "auto"):
         raise click.UsageError("--range and --device are for a detector with a network")
-    chosen = chosen_detector(detector, range, device, values, PAPER)
+    chosen = chosen_detector(detector, range, device, values,
+                             PAPER if detector == CANDIDATES else None)
     require_rclpy()  # before the drive is made
     recording = None if data is None else opened(data)
     if recording is not None:

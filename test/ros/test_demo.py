@@ -23,6 +23,7 @@ from lidar_perception.detectors.open import open_detector
 from lidar_perception.nodes import replay
 from lidar_perception.nodes.graph import FINAL, result_topics
 from lidar_perception.scoring.recorded import answered
+from lidar_perception.types import InputError
 
 FRAMES = 4  # tracks are confirmed
 
@@ -59,6 +60,25 @@ def test_in_real_time_as_many_clouds_wait_as_on_a_robot(
     monkeypatch.setattr(replay.Processes, "start", start)
     with pytest.raises(Enough):
         replay.replay(drive_bag, 1, tmp_path, PAPER, real_time=real_time)
+
+
+@pytest.mark.parametrize(("arguments", "node", "expected"), [
+    (["--set", "fused.scores.car=0.7", "--range", "around", "--device", "cpu"], "fused_detector",
+     {"fused.scores.car": 0.7, "fused.range": "around", "fused.device": "cpu"}),
+    (["--set", "ground.method=cloth"], "ground_segmentation", {"ground.method": "cloth"}),
+    (["--detector", "candidates", "--config", "best", "--set", "stm.shifts=1"],
+     "candidate_refinement", {"stm.shifts": 1, "stm.window": "metric"})], ids=range(3))
+def test_parameters_reach_the_nodes(drive_bag, tmp_path, monkeypatch, arguments, node, expected):
+    given = {}
+
+    def start(processes, name, remap, values):
+        given[name] = values
+        if name == "bag_recorder":
+            raise InputError("enough")
+
+    monkeypatch.setattr(replay.Processes, "start", start)
+    assert exit_of(monkeypatch, "demo", drive_bag, *arguments, "--out", tmp_path / "out") == 2
+    assert expected.items() <= given[node].items()
 
 
 def test_what_demo_did_not_make_stays(drive_bag, make_bag, tmp_path):
