@@ -17,7 +17,7 @@ from lidar_perception.types import LidarFrame
 from lidar_perception.wire.params import ViewParams
 
 
-@compilation_reported()
+@compilation_reported(all_of_it=True)
 def warm_up() -> None:
     """Run every stage and method once on a few made-up points, so that compiled code is loaded (or
     built and cached, the first time) before the first message arrives."""

@@ -13,6 +13,7 @@ from lidar_perception.cli.command import Choice, Command
 from lidar_perception.cli.data import out_folder
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labels.names import ALIASES
+from lidar_perception.runs.compiling import compilation_reported
 from lidar_perception.runs.folder import is_finished, unfinished
 from lidar_perception.runs.machine import cores
 from lidar_perception.runs.resuming import digest
@@ -54,6 +55,7 @@ from lidar_perception.types import InputError
 @click.option("--resume", is_flag=True, help="Resume an unfinished data set; needs identical "
               "settings.")
 @click.option("--force", is_flag=True, help="Replace an earlier simulated data set in --out.")
+@compilation_reported()
 def simulate(out: Path, layout: str, sensor_name: str, frames: int, seed: int,
              scene: str, kind: str | None, people: float, mount_height: float,
              streets_of: int | None, jobs: int | None, resume: bool, force: bool) -> None:

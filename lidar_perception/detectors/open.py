@@ -45,7 +45,7 @@ class Configured(Detector, Protocol):
         """Return this detector with another range, see base.NetworkDetector."""
 
 
-@compilation_reported()
+@compilation_reported(all_of_it=True)
 def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
                   sensor_height: float | None = None, min_score: float | None = None,
                   range: str = "auto", settings: Mapping[str, Any] = {}) -> Configured:

@@ -12,7 +12,7 @@ from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import DetectionOutputs
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.runs.compiling import one_at_a_time
+from lidar_perception.runs.compiling import compilation_reported, one_at_a_time
 from lidar_perception.runs.machine import cores
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.messages import cluster_column, column
@@ -32,7 +32,8 @@ class DetectorNode(ManagedNode):
     def configure(self) -> None:
         self.sensor = SensorCheck(self)
         self.outputs = DetectionOutputs(self, self.steps)
-        self.detector = self._loaded()
+        with compilation_reported(self.get_logger().info, all_of_it=True):
+            self.detector = self._loaded()
         config = self.detector.config
         self.counts.update(network=f"{self.name_of(config)}, {' '.join(config.classes)}",
                            device=str(self.detector.device))

@@ -27,7 +27,7 @@ WAITING = "waiting for another process to compile, or to load what is compiled"
 class _Compilation:
     """A listener to the events of Numba, which sends none when it loads code from its cache."""
 
-    _reported = threading.Lock()  # by the outermost block
+    current: _Compilation | None = None  # of the outermost block
 
     def __init__(self, say: Callable[[str], object]):
         self.say, self.over = say, threading.Event()
@@ -50,46 +50,70 @@ class _Compilation:
         """Seconds of compilation so far."""
         return self.seconds + (perf_counter() - self.begun if self.depth else 0.0)
 
+    def begin(self) -> None:
+        """Say that it begins, once."""
+        if not self.said:
+            self.said = True
+            self.say(COMPILING)
+
     def report(self) -> None:
         """Say how far it is, until the block is over."""
         limit = PATIENCE
         while not self.over.wait(TICK):
-            if (spent := self.spent()) >= limit:
-                self.say(f"compiling: {self.count} functions in {spent:.0f} s so far" if self.said
-                         else COMPILING)
-                self.said, limit = True, spent + EVERY
+            if (spent := self.spent()) < limit:
+                continue
+            if self.said and spent >= EVERY:
+                self.say(f"compiling: {self.count} functions in {spent:.0f} s so far")
+            self.begin()
+            limit = max(EVERY, spent + EVERY)
 
 
 @contextmanager
-def compilation_reported(say: Callable[[str], object] | None = None) -> Iterator[None]:
+def compilation_reported(say: Callable[[str], object] | None = None,
+                         all_of_it: bool = False) -> Iterator[None]:
     """Report when Numba compiles for more than PATIENCE seconds within the block.
 
     Args:
-        say: takes each line; None: standard error.
+        say: takes each line; None: standard error. Of nested blocks that of the outermost.
+        all_of_it: the block runs what a detector runs, so it compiles where nothing is cached yet;
+            that is reported at its start, before torch is loaded.
     """
-    if not _Compilation._reported.acquire(blocking=False):
+    outer = _Compilation.current
+    if outer is not None:
+        if all_of_it and not _cached():
+            outer.begin()
         yield
         return
+    from numba.core import event
+    if say is None:
+        from lidar_perception.runs.terminal import errors
+        say = errors.print
+    event.Listener.register(_Compilation)  # as a base class numba would be loaded at import
+    _Compilation.current = compilation = _Compilation(say)
+    reporter = threading.Thread(target=compilation.report, daemon=True)
+    event.register("numba:compile", compilation)
+    reporter.start()
     try:
-        from numba.core import event
-        if say is None:
-            from lidar_perception.runs.terminal import errors
-            say = errors.print
-        event.Listener.register(_Compilation)  # as a base class numba would be loaded at import
-        compilation = _Compilation(say)
-        reporter = threading.Thread(target=compilation.report, daemon=True)
-        reporter.start()
-        event.register("numba:compile", compilation)
-        try:
-            yield
-        finally:
-            event.unregister("numba:compile", compilation)
-            compilation.over.set()
-            reporter.join()
-        if compilation.said:
-            say(f"compiled {compilation.count} functions in {compilation.seconds:.1f} s")
+        if all_of_it and not _cached():
+            compilation.begin()
+        yield
     finally:
-        _Compilation._reported.release()
+        _Compilation.current = None
+        event.unregister("numba:compile", compilation)
+        compilation.over.set()
+        reporter.join()
+    if compilation.count and compilation.said:
+        say(f"compiled {compilation.count} functions in {compilation.seconds:.1f} s")
+
+
+def _cached() -> bool:
+    """Return True if Numba has cached a function that all detectors use, since its file changed."""
+    from lidar_perception import geometry
+    function, source = geometry.stable_order, Path(geometry.__file__)
+    if not hasattr(function, "stats"):  # NUMBA_DISABLE_JIT
+        return True
+    indices = Path(function.stats.cache_path).glob(f"{source.stem}.{function.__name__}-*.nbi")
+    return any(index.stat().st_mtime >= source.stat().st_mtime for index in indices)
 
 
 @contextmanager
