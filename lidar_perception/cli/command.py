@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from lidar_perception.types import did_you_mean, valid_names
 
@@ -38,6 +39,18 @@ class Choice(click.ParamType):
 
 def _plain(name: str) -> str:
     return name.strip().lower().replace("_", "-")
+
+
+def refuse_given(names: Iterable[str], reason: str) -> None:
+    """Raise UsageError if one of these parameters of the command that runs was given.
+
+    reason: the end of the message, such as "is for a simulated drive".
+    """
+    context = click.get_current_context()
+    for param in context.command.params:
+        if param.name in names and context.get_parameter_source(param.name) not in (
+                None, ParameterSource.DEFAULT):
+            raise click.UsageError(f"{param.opts[0]} {reason}")
 
 
 class Command(click.Command):

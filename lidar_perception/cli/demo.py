@@ -15,7 +15,7 @@ from rich.text import Text
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.classes import DETECTED
-from lidar_perception.cli.command import Choice, Command
+from lidar_perception.cli.command import Choice, Command, refuse_given
 from lidar_perception.cli.data import WHAT, data_argument, opened, out_folder
 from lidar_perception.cli.evaluate.candidates import as_recorded
 from lidar_perception.cli.options import (
@@ -103,6 +103,8 @@ def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: i
       lidar-perception demo drive.bag --rate 0.5 --single
       lidar-perception demo --detector candidates --config best
     """
+    if data is not None:
+        refuse_given(("frames", "drive_seed"), "is for a simulated drive, which DATA replaces")
     values, = settings.values(_runs(detector))
     if detector == CANDIDATES and (range != "auto" or device != "auto"):
         raise click.UsageError("--range and --device are for a detector with a network")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from lidar_perception.cli.command import Command
+from lidar_perception.cli.command import Command, refuse_given
 from lidar_perception.cli.data import (
     Walk,
     a_path,
@@ -73,6 +73,11 @@ def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None,
     from lidar_perception.scoring.kitti.tables import print_detection_report, print_intervals
     from lidar_perception.scoring.run import Start
 
+    if detector is None:
+        refuse_given(("min_score", "device"), "is for a detector that runs; --results DIR has its "
+                     "boxes already")
+    if not errors:
+        refuse_given(("errors_from",), "goes with --errors")
     if write_results is not None and detector is None:
         raise click.UsageError("--write-results writes the detections of a detector; --results DIR "
                                "has its files already")
