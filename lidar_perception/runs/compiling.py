@@ -109,7 +109,8 @@ def compilation_reported(say: Callable[[str], object] | None = None,
 def _cached() -> bool:
     """Return True if Numba has cached a function that all detectors use, since its file changed."""
     from lidar_perception import geometry
-    function, source = geometry.stable_order, Path(geometry.__file__)
+    function: Any = geometry.stable_order
+    source = Path(geometry.__file__)
     if not hasattr(function, "stats"):  # NUMBA_DISABLE_JIT
         return True
     indices = Path(function.stats.cache_path).glob(f"{source.stem}.{function.__name__}-*.nbi")
