@@ -31,9 +31,9 @@ def evaluate_detection(tmp_path, *arguments):
 
 
 def error_line(capsys) -> str:
-    """The one line on stderr that says what is wrong. Before it there may be what was opened, and
-    the empty line of a progress bar that ended."""
+    """The one line on stderr that says what is wrong. Before it there may be what was opened, that
+    code is compiled, and the empty line of a progress bar that ended."""
     *before, line = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("Error: ")
-    assert all(re.search(r": .*, \d+ frames?\b", each) for each in before if each), before
+    assert all(re.search(r": .*, \d+ frames?\b|^compiling ", each) for each in before if each), before
     return line
