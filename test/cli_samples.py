@@ -35,5 +35,6 @@ def error_line(capsys) -> str:
     code is compiled, and the empty line of a progress bar that ended."""
     *before, line = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("Error: ")
-    assert all(re.search(r": .*, \d+ frames?\b|^compiling ", each) for each in before if each), before
+    assert all(re.search(r": .*, \d+ frames?\b|^compiling ", each)
+               for each in before if each), before
     return line
