@@ -23,7 +23,7 @@ from benchmark.rows import print_ground, print_measured, print_planes
 from benchmark.simulation import measure_simulation
 from benchmark.timing import evenly_chosen
 from benchmark.tracking import measure_recording, print_tracking
-from lidar_perception.candidates.segmented import points_in_view
+from lidar_perception.candidates.segmented_cloud import crop_to_view
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, Frame, Recording
 from lidar_perception.data.open import open_recording
@@ -80,7 +80,7 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
                "peers": {p.package: p.version() for p in peers.ALL},
                "candidates": compare_candidates(frames, repeat)}
     print_comparison(content["candidates"])
-    in_view = [points_in_view(f, camera, ViewParams(enabled=True))[1].xyz
+    in_view = [crop_to_view(f, camera, ViewParams(enabled=True))[1].xyz
                for f, camera in _with_camera(recording, frames, count)]
     scans = _full_scans(recording, count)
     content |= _measure(in_view, scans, repeat)

@@ -7,10 +7,10 @@ from rich.table import Table
 
 from benchmark import plain_stm_cpa
 from lidar_perception.candidates.configurations import BEST, PAPER
-from lidar_perception.candidates.pipeline import find_candidates, refined
+from lidar_perception.candidates.pipeline import find_candidates, refine_segmented
 from lidar_perception.candidates.refine import STAGES
-from lidar_perception.candidates.seed_sources import truth_seed
-from lidar_perception.candidates.segmented import Segmented, grounded_boxes
+from lidar_perception.candidates.seed_sources import make_truth_source
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud, fit_grounded_boxes
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.data.frame import Frame
 from lidar_perception.runs.terminal import console, track
@@ -30,19 +30,20 @@ def compare_candidates(frames: list[Frame], repeat: int) -> dict:
         truth, scan, camera = pedestrians(f.truth()), f.load(), f.camera()
         arguments = scan.xyz, camera.projection, camera.width, camera.height, truth
         theirs = [plain_stm_cpa.candidates(*arguments) for _ in range(min(repeat, 3))]
-        mine = [find_candidates(scan, truth_seed(truth), camera, PAPER)
+        mine = [find_candidates(scan, make_truth_source(truth), camera, PAPER)
                 for _ in range(repeat)]
         _median_of_steps(plain, [r["ms"] for r in theirs])
         _median_of_steps(ours, [found.ms for _, found in mine])
-        _median_of_steps(best, [find_candidates(scan, truth_seed(truth), camera, BEST)[1].ms
+        _median_of_steps(best, [find_candidates(scan, make_truth_source(truth), camera, BEST)[1].ms
                                 for _ in range(repeat)])
         result = theirs[0]
         # The same ground for both: then clusters must be identical, and so the candidates.
         ids = cluster_obstacles(result["points"], result["ground"], PAPER.clustering)
         agree["labels_identical"] += np.array_equal(ids, result["labels"])
-        boxes = grounded_boxes(result["points"], result["ground"], ids, "axis_aligned")
-        segmented = Segmented(np.arange(len(ids)), result["points"], result["ground"], ids, boxes)
-        found = refined(segmented, truth_seed(truth), PAPER)
+        boxes = fit_grounded_boxes(result["points"], result["ground"], ids, "axis_aligned")
+        segmented = SegmentedCloud(np.arange(len(ids)), result["points"], result["ground"], ids,
+                                   boxes)
+        found = refine_segmented(segmented, make_truth_source(truth), PAPER)
         agree["candidates_same_given_ground"] += all(
             len(getattr(found, s)) == len(result[s]) == _shared(getattr(found, s).boxes, result[s])
             for s in STAGES)

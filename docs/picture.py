@@ -11,7 +11,7 @@ from PIL import Image
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
-from lidar_perception.candidates.seed_sources import fixed_seed
+from lidar_perception.candidates.seed_sources import make_fixed_source
 from lidar_perception.candidates.seeds import load_seed
 from lidar_perception.cli.main import cli
 from lidar_perception.clustering.cluster import cluster
@@ -68,7 +68,7 @@ def make(folder: Path = FOLDER) -> None:
     draw(folder / "scene.png", README, frame.xyz, by_cluster(ground, cluster_ids), found)
 
     # The displays that are on in the layouts: clusters, the ground, detections and candidates.
-    segmented, candidates = find_candidates(frame, fixed_seed(load_seed(
+    segmented, candidates = find_candidates(frame, make_fixed_source(load_seed(
         PipelineParams().seed.file)))
     draw(folder / "look.png", LOOK, segmented.xyz, by_cluster(
         segmented.ground, segmented.cluster_ids), found.followed_by(candidates.final))

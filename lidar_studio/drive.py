@@ -15,7 +15,7 @@ import numpy as np
 
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.pipeline import segment
+from lidar_perception.candidates.pipeline import segment_cloud
 from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.param_fields import with_values
@@ -65,7 +65,7 @@ def settings(frame: Frame) -> PipelineParams:
 def scanned(frame: Frame) -> Scan:
     """The cloud of a frame with ground and clusters. InputError where it cannot be read."""
     cloud = frame.load()
-    found = segment(cloud, None, settings(frame))
+    found = segment_cloud(cloud, None, settings(frame))
     return scan_of(cloud, found.ground, found.cluster_ids)
 
 

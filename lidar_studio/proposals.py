@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.candidates.confidence import confidence
+from lidar_perception.candidates.confidence import compute_confidence
 from lidar_perception.candidates.configurations import BEST
-from lidar_perception.candidates.silhouette import similarity
+from lidar_perception.candidates.silhouette import compute_similarity
 from lidar_perception.classes import Size
 from lidar_perception.detectors.contract import FUSED
 from lidar_perception.geometry import centre_distances
@@ -72,9 +72,9 @@ def likeness(look: Look, seeds: Sequence[SeedLook]) -> Array:
     without seeds."""
     best = np.zeros(len(look.boxes))
     for seed in seeds if len(look.boxes) else ():
-        alike = similarity(look.images, seed.image, BEST.stm)
-        best = np.maximum(best, confidence(look.features, alike,
-                                           look.features["height_m"] - seed.height))
+        alike = compute_similarity(look.images, seed.image, BEST.stm)
+        best = np.maximum(best, compute_confidence(look.features, alike,
+                                                   look.features["height_m"] - seed.height))
     return best
 
 

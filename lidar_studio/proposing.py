@@ -15,7 +15,7 @@ import numpy as np
 
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.seeds import Seed, seed_from_points
-from lidar_perception.candidates.silhouette import similarity, to_pixels
+from lidar_perception.candidates.silhouette import compute_similarity, to_pixels
 from lidar_perception.classes import Size
 from lidar_perception.detectors.contract import FUSED
 from lidar_perception.detectors.open import DetectorChoice
@@ -157,7 +157,7 @@ class Proposer:
         if seen is None:
             raise InputError(f"track {track.id} has too few points in frame {frame} to be compared")
         image, templates = seen.silhouette(BEST), [seed.silhouette(BEST) for seed in seeds]
-        scores = [float(similarity(image[None], t, BEST.stm)[0]) for t in templates]
+        scores = [float(compute_similarity(image[None], t, BEST.stm)[0]) for t in templates]
         best = int(np.argmax(scores))
         return {"seed": _drawn(to_pixels(templates[best])), "candidate": _drawn(to_pixels(image)),
                 "similarity": scores[best]}

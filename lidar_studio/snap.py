@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.candidates.params import SeedParams
-from lidar_perception.candidates.seeds import clicked_cluster
+from lidar_perception.candidates.seeds import find_clicked_cluster
 from lidar_perception.classes import DETECTED, Size
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.geometry import points_in_box, to_box_frame, wrap_angle
@@ -30,7 +30,7 @@ WIDER = 1.3        # times the width: a side that is no longer than this is the 
 def around_click(scan: Scan, click: Array, class_name: str) -> Array:
     """(7,) the box of the cluster at a point (3,), on the ground and as large as the class usually
     is. InputError where no cluster is near."""
-    label = clicked_cluster(click, scan.xyz, scan.cluster_ids, SeedParams().click_radius)
+    label = find_clicked_cluster(click, scan.xyz, scan.cluster_ids, SeedParams().click_radius)
     members = scan.cluster_ids == label
     usual = usual_size(class_name)
     if usual is not None and usual[0] > LONG:  # of which one cluster is often but a piece

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.candidates.confidence import shape_features
+from lidar_perception.candidates.confidence import compute_shape_features
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.pipeline import segment
-from lidar_perception.candidates.segmented import Segmented
-from lidar_perception.candidates.silhouette import ROWS, silhouettes
+from lidar_perception.candidates.pipeline import segment_cloud
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud
+from lidar_perception.candidates.silhouette import ROWS, draw_silhouettes
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.contract import Detector
@@ -56,7 +56,7 @@ def look_at(frame: Frame, detector: Detector | None = None,
     """See Look; without a detector there are no detections, and without odometry, which is given
     the frames in their order, no pose. InputError where the frame cannot be read."""
     cloud, params = frame.load(), settings(frame)
-    found = segment(cloud, None, params)
+    found = segment_cloud(cloud, None, params)
     detections = Detections.none() if detector is None else detector(cloud).detections
     pose = None if odometry is None else odometry(cloud.xyz)
     counts = np.bincount(found.cluster_ids, minlength=len(found.boxes) + 1)[1:]
@@ -70,7 +70,7 @@ def look_at(frame: Frame, detector: Detector | None = None,
                                                params), things, pose)
 
 
-def _things(found: Segmented, counts: Array) -> Array:
+def _things(found: SegmentedCloud, counts: Array) -> Array:
     """(T, 7) float32."""
     height, across = found.boxes[:, 5], np.hypot(found.boxes[:, 3], found.boxes[:, 4])
     chosen = np.flatnonzero((height >= THINGS[0]) & (height <= THINGS[1]) & (across <= LONGEST)
@@ -87,8 +87,8 @@ def _described(xyz: Array, cluster_ids: Array, boxes: Array, numbers: Array,
                params: PipelineParams) -> tuple[Array, dict[str, Array]]:
     points, start = group_points(xyz, cluster_ids, numbers)
     floors = (boxes[:, 2] - boxes[:, 5] / 2).astype(np.float64)
-    images = silhouettes(points, start, np.ones((len(boxes), 1)), floors, params)
-    return images, shape_features(points, start, boxes, params)
+    images = draw_silhouettes(points, start, np.ones((len(boxes), 1)), floors, params)
+    return images, compute_shape_features(points, start, boxes, params)
 
 
 def surveyed(drive: Drive, choice: DetectorChoice | None, here: bool = False,

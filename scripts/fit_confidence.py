@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from lidar_perception.candidates import confidence as module
-from lidar_perception.candidates.confidence import SEED_KNOTS, SHAPE_KNOTS, shape_features
+from lidar_perception.candidates.confidence import SEED_KNOTS, SHAPE_KNOTS, compute_shape_features
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.pipeline import segment
-from lidar_perception.candidates.seed_sources import truth_seed
+from lidar_perception.candidates.pipeline import segment_cloud
+from lidar_perception.candidates.seed_sources import make_truth_source
 from lidar_perception.candidates.seeds import Seed
-from lidar_perception.candidates.silhouette import silhouettes, similarity
+from lidar_perception.candidates.silhouette import compute_similarity, draw_silhouettes
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.groups import group_points
@@ -48,15 +48,16 @@ def samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | None:
     """Features of the clusters of one frame, against a seed of another frame, as one's own cluster
     says nothing; hit (K,) bool; bins of range of the clusters and of the pedestrians."""
     truth = pedestrians(frame)
-    segmented = segment(frame.load(), frame.camera(), params)
+    segmented = segment_cloud(frame.load(), frame.camera(), params)
     boxes, ids = segmented.boxes, np.arange(1, len(segmented.boxes) + 1)
     if len(boxes) == 0:
         return None
     points, start = group_points(segmented.xyz, segmented.cluster_ids, ids)
-    features = shape_features(points, start, boxes, params)
-    images = silhouettes(points, start, np.ones((len(boxes), 1)), boxes[:, 2] - boxes[:, 5] / 2,
-                         params)
-    features["similarity"] = similarity(images, seed.silhouette(params), params.stm)
+    features = compute_shape_features(points, start, boxes, params)
+    images = draw_silhouettes(points, start, np.ones((len(boxes), 1)),
+                              boxes[:, 2] - boxes[:, 5] / 2,
+                              params)
+    features["similarity"] = compute_similarity(images, seed.silhouette(params), params.stm)
     features["height_difference_m"] = np.abs(features["height_m"] - seed.height)
     found, _ = match_centres(boxes, truth)
     return {"features": features, "hit": np.isin(np.arange(len(boxes)), found),
@@ -67,8 +68,8 @@ def seed_of(job: tuple[str, int]) -> Seed | None:
     """The nearest pedestrian of a frame, as in the paper's protocol."""
     frame = open_recording(job[0]).frames[job[1]]
     try:
-        segmented = segment(frame.load(), frame.camera(), BEST)
-        return truth_seed(pedestrians(frame))(segmented)
+        segmented = segment_cloud(frame.load(), frame.camera(), BEST)
+        return make_truth_source(pedestrians(frame))(segmented)
     except InputError:
         return None
 

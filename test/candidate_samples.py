@@ -1,4 +1,4 @@
-"""A made-up scene of people and other things on flat ground, for the tests of candidates."""
+"""Synthetic scene of people and other objects on flat ground, for the tests of candidates."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ PEOPLE = np.array([[7, 2], [12, -5], [20, 4]])
 
 
 def person(x, y, count=400, seed=0, height=1.75):
-    """Points of a head, a torso and two legs that stand on the ground at x, y, facing us."""
+    """Return points of a person at x, y facing the sensor: a head, a torso and two legs."""
     rng = np.random.default_rng(seed)
     part = rng.choice(4, count, p=[0.15, 0.45, 0.2, 0.2])
     low = np.array([[-0.12, 1.45], [-0.25, 0.8], [-0.2, 0.06], [0.05, 0.06]])[part]
@@ -19,7 +19,7 @@ def person(x, y, count=400, seed=0, height=1.75):
 
 
 def block(x, y, size, count=600, seed=0):
-    """A box of points with its bottom 0.06 m above the ground."""
+    """Return points that fill a box whose bottom is 0.06 m above the ground."""
     low = [x, y, GROUND_Z + 0.06]
     return low + np.random.default_rng(seed).random((count, 3)) * size
 
@@ -30,7 +30,7 @@ def floor(seed=0):
 
 
 def scene():
-    """A floor, three people and two things of other shapes, one of them of a person's height."""
+    """Return a floor, three people and two other objects, one of them as high as a person."""
     parts = [floor(), *(person(*at, seed=i) for i, at in enumerate(PEOPLE)),
              block(10, 8, [2.0, 3.0, 1.3]), block(13, 3, [0.2, 0.6, 1.69])]
     return np.concatenate(parts).astype(np.float32)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lidar_perception.candidates.pipeline import segment
+from lidar_perception.candidates.pipeline import segment_cloud
 from lidar_perception.clustering.cluster import cluster, cluster_obstacles
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.ground.segment import segment_ground
@@ -189,9 +189,10 @@ def test_clusters_of_an_array_are_those_of_its_frame():
     with pytest.raises(InputError, match="ground has 3 values for 400 points"):
         cluster_obstacles(CLOUD, np.zeros(3, bool))
     with pytest.raises(InputError, match="cluster_ids has 3 values for 400 points"):
-        segment(CLOUD, cluster_ids=np.zeros(3, int))
-    expected = segment(LidarFrame.of(CLOUD))
-    for same in (segment(CLOUD), segment(CLOUD.tolist(), ground=expected.ground.tolist())):
+        segment_cloud(CLOUD, cluster_ids=np.zeros(3, int))
+    expected = segment_cloud(LidarFrame.of(CLOUD))
+    for same in (segment_cloud(CLOUD),
+                 segment_cloud(CLOUD.tolist(), ground=expected.ground.tolist())):
         assert np.array_equal(same.cluster_ids, expected.cluster_ids)
 
 

@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 
 from experiments.realism.roughness import roughness
 from lidar_perception.camera import Camera
-from lidar_perception.candidates.boxes import height_matches
+from lidar_perception.candidates.boxes import select_by_height
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.pipeline import segment
+from lidar_perception.candidates.pipeline import segment_cloud
 from lidar_perception.candidates.refine import STAGES
 from lidar_perception.classes import CAR, DETECTED
 from lidar_perception.geometry import box_corners, horizontal_range, points_in_box, to_box_frame
@@ -112,9 +112,9 @@ def scan_rows(frame: LidarFrame, params: PipelineParams = PipelineParams()) -> d
     count = np.bincount(where, minlength=bins)
     ground = segment_ground(frame, GroundParams(method="cloth"))
     on_ground = np.bincount(where.compress(ground), minlength=bins)
-    boxes = segment(frame, params=params).boxes
+    boxes = segment_cloud(frame, params=params).boxes
     at = _bin(horizontal_range(boxes), RANGES)
-    person = height_matches(boxes, PERSON_HEIGHT, params.height)
+    person = select_by_height(boxes, PERSON_HEIGHT, params.height)
     rows = {"scan points": [len(xyz)], "points": count,
             "elevation": np.histogram(elevation, ELEVATIONS)[0],
             "ground share": np.where(count >= MIN_IN_BIN, on_ground / np.maximum(count, 1),

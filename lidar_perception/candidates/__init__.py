@@ -1,1 +1,1 @@
-"""Paper A: clusters to pedestrian candidates (Yeom, Kim, Kook, Appl. Sci. 2026, 16(13), 6286)."""
+"""Pedestrian candidates among clusters: paper A (Yeom, Kim, Kook, Appl. Sci. 2026, 16(13), 6286)"""

@@ -8,8 +8,10 @@ from lidar_perception.candidates.params import HeightParams
 
 
 def snap_to_ground(boxes: np.ndarray, plane: np.ndarray | None) -> np.ndarray:
-    """Boxes (K, 7) with the bottom face moved down to the plane under the box centre; a box that
-    already reaches below it stays. Without a plane nothing moves. Paper A, Section 3.4."""
+    """Return boxes (K, 7) whose bottom is lowered to the plane under their centre (Section 3.4).
+
+    A box that already reaches below the plane is not changed. Without a plane no box is.
+    """
     snapped = boxes.copy()
     if plane is None:
         return snapped
@@ -21,6 +23,6 @@ def snap_to_ground(boxes: np.ndarray, plane: np.ndarray | None) -> np.ndarray:
     return snapped
 
 
-def height_matches(boxes: np.ndarray, seed_height: float, params: HeightParams) -> np.ndarray:
-    """(K,) bool: |h - h_seed| <= tolerance. Paper A, Section 3.5."""
+def select_by_height(boxes: np.ndarray, seed_height: float, params: HeightParams) -> np.ndarray:
+    """Return (K,) bool: |h - h_seed| <= tolerance (Section 3.5)."""
     return np.abs(boxes[:, 5] - seed_height) <= params.tolerance

@@ -1,8 +1,8 @@
-"""How sure a candidate is: the probability that a cluster is a pedestrian, from its shape and, if
-there is a seed, from its likeness to that.
+"""Confidence of a candidate: the probability that a cluster is a pedestrian.
 
-The log-odds are a sum of curves, one a feature, each given by its values at a few knots. They were
-fitted to simulated scans alone (scripts/fit_confidence.py); confidence.json holds them.
+It depends on the cluster's shape and, with a seed, on the similarity to the seed. The log-odds are
+a sum of one curve per feature, given by its values at a few knots. confidence.json holds the
+curves, which were fitted to simulated scans only (scripts/fit_confidence.py).
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from lidar_perception.candidates.curves import log_odds
+from lidar_perception.candidates.curves import compute_log_odds
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.silhouette import (
     COLUMNS,
-    HEIGHT,
     ROWS,
-    WIDTH,
-    covered,
-    silhouettes,
+    WINDOW_HEIGHT_M,
+    WINDOW_WIDTH_M,
+    count_pixels,
+    draw_silhouettes,
 )
 from lidar_perception.param_fields import with_values
 
-SHAPE_KNOTS = {  # feature -> where its curve bends; it is level beyond the first and the last
+SHAPE_KNOTS = {  # feature -> knots of its curve, which is constant beyond the first and the last
     "range_m": (5, 10, 15, 20, 30, 40, 55),
     "height_m": (0.8, 1.2, 1.5, 1.65, 1.8, 1.95, 2.1, 2.5),
     "length_m": (0.2, 0.4, 0.6, 0.8, 1.0, 1.3, 2.0),
@@ -40,27 +40,35 @@ SHAPE_KNOTS = {  # feature -> where its curve bends; it is level beyond the firs
 }
 SEED_KNOTS = {"similarity": (0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0),
               "height_difference_m": (0.0, 0.1, 0.2, 0.35, 0.6)}
-PIXEL_AREA = HEIGHT / ROWS * WIDTH / COLUMNS  # square metres
+PIXEL_AREA_M2 = WINDOW_HEIGHT_M / ROWS * WINDOW_WIDTH_M / COLUMNS
 
 
-def shape_features(xyz: np.ndarray, start: np.ndarray, boxes: np.ndarray,
-                   params: PipelineParams = PipelineParams()) -> dict[str, np.ndarray]:
-    """The features of SHAPE_KNOTS, each (K,) float64, of K clusters: xyz (N, 3) and start (K + 1,)
-    as in silhouette.py, boxes (K, 7) that stand on the ground.
+def compute_shape_features(xyz: np.ndarray, start: np.ndarray, boxes: np.ndarray,
+                           params: PipelineParams = PipelineParams()) -> dict[str, np.ndarray]:
+    """Compute the features of SHAPE_KNOTS of K clusters.
 
-    range_m: of the centroid, horizontal. height_m: of the top above the ground, and half a beam
-    step, as the true top is between two beams. length_m, width_m: extent along and across the
-    widest direction in x-y. area_m2: points times the surface that each stands for.
-    hidden_below_m: from the ground to the lowest point, less a beam step. upright: standard
-    deviation of z by the height. fill: drawn part of the rectangle height x length. lopsided:
-    between the median and the middle of the extent, by the length.
+    Args:
+        xyz, start: (N, 3) points and (K + 1,) first row of each cluster, as in silhouette.py.
+        boxes: (K, 7), standing on the ground.
+
+    Returns:
+        Arrays (K,) float64 by name:
+        range_m: horizontal range of the centroid.
+        height_m: height of the top above the ground plus half a beam step, because the true top is
+            between two beams.
+        length_m, width_m: extent along and across the widest direction in x-y.
+        area_m2: number of points times the surface area per point.
+        hidden_below_m: height of the lowest point above the ground, minus a beam step.
+        upright: standard deviation of z divided by the height.
+        fill: drawn share of the rectangle height x length.
+        lopsided: distance of the median from the middle of the extent, divided by the length.
     """
     stm = {"stm.window": "metric", "stm.spread": True, "stm.dilations": 0, "stm.axis": "yaw"}
     floors = boxes[:, 2].astype(float) - boxes[:, 5] / 2
-    drawn = covered(silhouettes(xyz, start, np.ones((len(boxes), 1)), floors,
-                                with_values(params, stm))) * PIXEL_AREA
+    drawn = count_pixels(draw_silhouettes(xyz, start, np.ones((len(boxes), 1)), floors,
+                                          with_values(params, stm))) * PIXEL_AREA_M2
     count = np.diff(start)
-    ranges, low, high, spread, length, width, middle = _moments(
+    ranges, low, high, spread, length, width, middle = _compute_moments(
         np.ascontiguousarray(xyz, np.float32), np.asarray(start, np.int64)).T
     beam = ranges * np.radians(params.resolution.elevation_step)
     height = np.maximum(high - floors, 0.1)
@@ -77,27 +85,34 @@ def shape_features(xyz: np.ndarray, start: np.ndarray, boxes: np.ndarray,
     }
 
 
-def confidence(shape: dict[str, np.ndarray], similarity: np.ndarray | None = None,
-               height_difference: np.ndarray | None = None) -> np.ndarray:
-    """(K,) float64 probability 0..1 that each cluster is a pedestrian. With similarity (K,) to a
-    seed and height_difference (K,) in metres, from these too. The probability is that of the
-    simulated scans, where pedestrians are as far away as in KITTI's labels (paper A, Table 1)."""
+def compute_confidence(shape: dict[str, np.ndarray], similarity: np.ndarray | None = None,
+                       height_difference: np.ndarray | None = None) -> np.ndarray:
+    """Return (K,) float64 the probability that each cluster is a pedestrian, 0..1.
+
+    The probability holds for simulated scans whose pedestrians are distributed over range as in
+    KITTI's labels (paper A, Table 1).
+
+    Args:
+        shape: features by compute_shape_features.
+        similarity, height_difference: (K,) similarity to a seed, and difference to its height in
+            metres; both or neither.
+    """
     features = dict(shape)
     if similarity is not None and height_difference is not None:
         features.update(similarity=similarity, height_difference_m=np.abs(height_difference))
-    model = _models()["shape" if similarity is None else "seed"]
-    return 1.0 / (1.0 + np.exp(-log_odds(model, features)))
+    model = _load_models()["shape" if similarity is None else "seed"]
+    return 1.0 / (1.0 + np.exp(-compute_log_odds(model, features)))
 
 
 @functools.cache
-def _models() -> dict[str, Any]:
+def _load_models() -> dict[str, Any]:
     return json.loads((files("lidar_perception.candidates") / "confidence.json").read_text())
 
 
 @njit(cache=True)
-def _moments(xyz, start):
-    """(K, 7): horizontal range of the centroid, lowest and highest z, standard deviation of z,
-    extent along and across the widest direction, distance of the median from the middle."""
+def _compute_moments(xyz, start):
+    """Return (K, 7): horizontal range of the centroid, lowest and highest z, standard deviation of
+    z, extent along and across the widest direction, distance of the median from the middle."""
     out = np.zeros((len(start) - 1, 7))
     for k in range(len(start) - 1):
         points = xyz[start[k]:start[k + 1]].astype(np.float64)

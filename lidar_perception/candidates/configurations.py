@@ -1,4 +1,4 @@
-"""The named settings of the candidate pipeline."""
+"""Named configurations of the candidate pipeline."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lidar_perception.param_fields import with_values
 # defaults of params.py are the paper's numbers.
 PAPER_VALUES = {"view.enabled": True, "seed.source": "ground_truth"}
 
-# What found most pedestrians on frames that it was not tuned on, with any source of the seed.
+# These values found most pedestrians on frames that they were not tuned on, with every seed source.
 # docs/reproduce.md has the figures.
 BEST_VALUES = {
     "clustering.density": FULL_DENSITY,
@@ -18,16 +18,16 @@ BEST_VALUES = {
     "clustering.dbscan.eps": (0.15, 0.30, 0.50, 0.70),
     "clustering.dbscan.min_samples": 5,
     "clustering.dbscan.join_bands": True,
-    "height.tolerance": 0.6,       # only spares work: the confidence knows the height
+    "height.tolerance": 0.6,       # only saves time: the confidence accounts for the height
     "stm.window": "metric",
     "stm.spread": True,
     "stm.dilations": 0,
     "stm.seen_only": True,
     "stm.shifts": 2,
-    "cpa.steps": 0,                # points drawn in their true size need no copies
+    "cpa.steps": 0,                # points drawn with `spread` need no copies
     "confidence.enabled": True,
     "confidence.threshold": 0.25,
-    "seed.min_confidence": 0.9,    # of seeds that nobody vouches for the template's is the best
+    "seed.min_confidence": 0.9,    # below this, the template is the better seed
 }
 PAPER = with_values(PipelineParams(), PAPER_VALUES)
 BEST = with_values(PAPER, BEST_VALUES)

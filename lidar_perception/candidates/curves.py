@@ -1,4 +1,4 @@
-"""Log-odds as a sum of curves, one a feature, each given by its values at a few knots."""
+"""Log-odds as a sum of one curve per feature, given by its values at a few knots."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ from typing import Any
 import numpy as np
 
 
-def log_odds(model: Mapping[str, Any], features: Mapping[str, np.ndarray]) -> np.ndarray:
-    """(K,) float64 of K things with features (K,), by name. model: `bias`, and by feature its curve
-    with `knots` and `values`, level beyond the first and the last; and what NaN counts,
-    `unknown`, 0 where there is none."""
+def compute_log_odds(model: Mapping[str, Any], features: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Compute the log-odds (K,) float64 of K objects.
+
+    Args:
+        model: `bias`, and `curves` with the `knots` and `values` of each feature. A curve is
+            constant beyond its first and last knot. A NaN feature adds the curve's `unknown`, by
+            default 0.
+        features: arrays (K,) by name.
+    """
     odds = np.full(len(next(iter(features.values()))), float(model["bias"]))
     for name, curve in model["curves"].items():
         values = np.interp(features[name], curve["knots"], curve["values"])

@@ -1,4 +1,4 @@
-"""The numbers of paper A's candidates, and of its whole pipeline."""
+"""Parameters of paper A's candidates, and of the whole candidate pipeline."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class HeightParams(Params):
 
 @dataclass(frozen=True)
 class ResolutionParams(Params):
-    """How densely the sensor samples; 0.43 and 0.17 degrees are the HDL-64E's of KITTI."""
+    """Angular resolution of the sensor; the defaults are those of KITTI's HDL-64E."""
 
     elevation_step: float = param(0.43, "Angle between neighbouring beams.", unit="deg",
                                   low=0.01, high=20.0)
@@ -72,7 +72,7 @@ class CpaParams(Params):
 
 @dataclass(frozen=True)
 class ConfidenceParams(Params):
-    """A probability for each candidate from its shape and its likeness to the seed."""
+    """Probability of each candidate, from its shape and its similarity to the seed."""
 
     enabled: bool = param(False, "Accept by confidence instead of by similarity alone, and give "
                           "it as the score. It was fitted to what the configuration best finds.")
@@ -84,7 +84,7 @@ SEED_SOURCES = ("ground_truth", "click", "file", "automatic")
 
 @dataclass(frozen=True)
 class SeedParams(Params):
-    """Where the seed pedestrian comes from (paper A, Section 3.5)."""
+    """Source of the seed pedestrian (paper A, Section 3.5)."""
 
     source: str = param(
         "file", "ground_truth: nearest Pedestrian of the frame's labels (the paper's protocol). "
@@ -99,13 +99,13 @@ class SeedParams(Params):
                                 unit="m", low=0.01, high=100.0)
 
 
-# The steps of the candidate pipeline whose times are taken, in order.
+# The steps of the candidate pipeline whose durations are measured, in order.
 STEPS = ("view", "ground", "clustering", "boxes", "height", "stm", "cpa", "confidence")
 
 
 @dataclass(frozen=True)
 class PipelineParams:
-    """All groups of the candidate pipeline, in the order of the stages."""
+    """All parameter groups of the candidate pipeline, in the order of the stages."""
 
     input: InputParams = InputParams()
     crop: CropParams = CropParams()

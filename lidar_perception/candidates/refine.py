@@ -1,4 +1,4 @@
-"""Clusters to pedestrian candidates: ground snapping, height filter, STM, CPA (paper A)."""
+"""Clusters to pedestrian candidates: height filter, STM and CPA (paper A)."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from time import perf_counter
 
 import numpy as np
 
-from lidar_perception.candidates.boxes import height_matches
-from lidar_perception.candidates.confidence import confidence, shape_features
+from lidar_perception.candidates.boxes import select_by_height
+from lidar_perception.candidates.confidence import compute_confidence, compute_shape_features
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.seeds import Seed, own_cluster
-from lidar_perception.candidates.silhouette import cpa_scales, silhouettes, similarity
+from lidar_perception.candidates.seeds import Seed, find_seed_cluster
+from lidar_perception.candidates.silhouette import (
+    compute_cpa_scales,
+    compute_similarity,
+    draw_silhouettes,
+)
 from lidar_perception.groups import group_points
 from lidar_perception.types import PEDESTRIAN, Detections
 
@@ -20,9 +24,11 @@ STAGES = ("stage1", "stage2", "final")
 
 @dataclass(frozen=True)
 class Candidates:
-    """Detections after the height filter (stage1), STM (stage2) and STM with CPA (final); scores
-    are the similarity with the seed (stage1: without CPA), or the confidence where that is on.
-    clusters (K,) int64: the numbers of the clusters of `final`, ascending. ms: time of each step.
+    """Detections after the height filter (stage1), STM (stage2) and STM with CPA (final).
+
+    Scores are the similarity to the seed (stage1: without CPA) or, if enabled, the confidence.
+    clusters (K,) int64 are the ids of the clusters of `final`, ascending; ms is the duration of
+    each step.
     """
 
     stage1: Detections
@@ -36,38 +42,42 @@ class Candidates:
         return Candidates(Detections.none(), Detections.none(), Detections.none())
 
 
-def refine(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, seed: Seed,
-           params: PipelineParams = PipelineParams()) -> Candidates:
-    """Candidates among clusters 1..K of points (N, 3), ids (N,), ground-snapped boxes (K, 7)."""
+def refine_clusters(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, seed: Seed,
+                    params: PipelineParams = PipelineParams()) -> Candidates:
+    """Find the candidates among clusters 1..K of points (N, 3).
+
+    labels (N,) are the points' cluster ids, boxes (K, 7) are snapped to the ground.
+    """
     t0 = perf_counter()
-    kept = np.flatnonzero(height_matches(boxes, seed.height, params.height))
+    kept = np.flatnonzero(select_by_height(boxes, seed.height, params.height))
     boxes = boxes[kept]
     floors = boxes[:, 2] - boxes[:, 5] / 2
     t1 = perf_counter()
     template = seed.silhouette(params)
     points, start = group_points(xyz, labels, kept + 1)
-    plain = similarity(silhouettes(points, start, np.ones((len(kept), 1)), floors, params),
-                       template, params.stm)
+    images = draw_silhouettes(points, start, np.ones((len(kept), 1)), floors, params)
+    plain = compute_similarity(images, template, params.stm)
     t2 = perf_counter()
     ranges = np.hypot(boxes[:, 0], boxes[:, 1])
-    scales = cpa_scales(ranges, params.cpa)
+    scales = compute_cpa_scales(ranges, params.cpa)
     chosen = np.flatnonzero((scales < 1.0).any(axis=1))
     final = plain.copy()
     if len(chosen):
-        augmented = group_points(xyz, labels, kept[chosen] + 1)
-        final[chosen] = similarity(silhouettes(*augmented, scales[chosen], floors[chosen], params),
-                                   template, params.stm)
+        images = draw_silhouettes(*group_points(xyz, labels, kept[chosen] + 1), scales[chosen],
+                                  floors[chosen], params)
+        final[chosen] = compute_similarity(images, template, params.stm)
     t3 = perf_counter()
     threshold = params.stm.threshold
     if params.confidence.enabled:
         threshold = params.confidence.threshold
-        shape = shape_features(points, start, boxes, params)
-        # The seed is as like itself as can be, which says nothing: it is what it was taken for.
-        own = own_cluster(seed, points, start)
-        itself = 1.0 if seed.certain else confidence(shape)
-        plain, final = (np.where(own, itself, confidence(shape, alike, shape["height_m"]
-                                                         - seed.height))
-                        for alike in (plain, final))
+        shape = compute_shape_features(points, start, boxes, params)
+        # The similarity of the seed's own cluster carries no information: it is always 1.
+        is_seed = find_seed_cluster(seed, points, start)
+        seed_confidence = 1.0 if seed.certain else compute_confidence(shape)
+        height_difference = shape["height_m"] - seed.height
+        plain, final = (np.where(is_seed, seed_confidence,
+                                 compute_confidence(shape, similarity, height_difference))
+                        for similarity in (plain, final))
     t4 = perf_counter()
 
     def detections(scores: np.ndarray, accepted: np.ndarray) -> Detections:

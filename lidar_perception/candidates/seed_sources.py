@@ -1,4 +1,4 @@
-"""Where a frame's seed pedestrian comes from: labels, a click, a template, the frame itself."""
+"""Sources of the seed pedestrian: labels, a click, a template, or the cloud itself."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lidar_perception.candidates.confidence import confidence, shape_features
+from lidar_perception.candidates.confidence import compute_confidence, compute_shape_features
 from lidar_perception.candidates.params import PipelineParams, SeedParams
 from lidar_perception.candidates.seeds import (
     MIN_POINTS,
@@ -15,37 +15,38 @@ from lidar_perception.candidates.seeds import (
     seed_from_points,
     seed_from_truth,
 )
-from lidar_perception.candidates.segmented import Segmented
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.groups import group_points
 
-# The seed, given the frame's clusters.
-SeedSource = Callable[[Segmented], Seed]
+# Returns the seed for a segmented cloud.
+SeedSource = Callable[[SegmentedCloud], Seed]
 
 
-def truth_seed(pedestrians: np.ndarray) -> SeedSource:
-    """Nearest pedestrian of boxes (M, 7), the paper's protocol."""
+def make_truth_source(pedestrians: np.ndarray) -> SeedSource:
+    """Return a source that takes the nearest pedestrian of boxes (M, 7), the paper's protocol."""
     return lambda s: seed_from_truth(s.xyz, s.ground, pedestrians)
 
 
-def clicked_seed(click: np.ndarray, params: SeedParams = SeedParams()) -> SeedSource:
-    """The cluster at a point (3,) in the LiDAR frame."""
+def make_click_source(click: np.ndarray, params: SeedParams = SeedParams()) -> SeedSource:
+    """Return a source that takes the cluster at a point (3,) in the LiDAR frame."""
     return lambda s: seed_from_click(click, s.xyz, s.cluster_ids, s.boxes, params.click_radius)
 
 
-def automatic_seed(template: Seed, params: PipelineParams) -> SeedSource:
-    """The cluster of the frame that is most like a pedestrian, or the template where none is."""
-    def source(s: Segmented) -> Seed:
+def make_automatic_source(template: Seed, params: PipelineParams) -> SeedSource:
+    """Return a source that takes the cluster most likely to be a pedestrian, or the template."""
+    def source(s: SegmentedCloud) -> Seed:
         clusters = np.arange(1, len(s.boxes) + 1)
-        likely = confidence(shape_features(*group_points(s.xyz, s.cluster_ids, clusters), s.boxes,
-                                           params))
+        likely = compute_confidence(compute_shape_features(*group_points(s.xyz, s.cluster_ids,
+                                                                         clusters), s.boxes,
+                                                           params))
         likely[np.bincount(s.cluster_ids, minlength=len(s.boxes) + 1)[1:] < MIN_POINTS] = -1.0
-        if likely.max(initial=-1.0) < params.seed.min_confidence:  # which may be 0
+        if likely.max(initial=-1.0) < params.seed.min_confidence:  # min_confidence may be 0
             return template
         best = int(likely.argmax())
         return seed_from_points(s.xyz[s.cluster_ids == best + 1], s.boxes[best])
     return source
 
 
-def fixed_seed(seed: Seed) -> SeedSource:
-    """The same seed in every frame."""
+def make_fixed_source(seed: Seed) -> SeedSource:
+    """Return a source that takes the same seed for every cloud."""
     return lambda s: seed

@@ -1,4 +1,4 @@
-"""The seed pedestrian: its points and height (paper A, Section 3.5)."""
+"""The seed pedestrian and its template file (paper A, Section 3.5)."""
 
 from __future__ import annotations
 
@@ -10,21 +10,24 @@ from pathlib import Path
 import numpy as np
 
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.silhouette import silhouettes, to_pixels
+from lidar_perception.candidates.silhouette import draw_silhouettes, to_pixels
 from lidar_perception.geometry import points_in_box
 from lidar_perception.runs.files import read_text, short, write_text
 from lidar_perception.types import MAX_RANGE, InputError
 
-MIN_POINTS = 10  # a thinner seed has no shape to compare with; DBSCAN's min_samples likewise
-DIGITS = 4  # of a metre, in a template
-MAX_BYTES = 10**7  # of a template: some 200,000 points
+MIN_POINTS = 10  # fewer points have no shape to compare with; as DBSCAN's min_samples
+DECIMALS = 4  # of metres in a template file
+MAX_TEMPLATE_BYTES = 10**7  # about 200,000 points
 
 
 @dataclass(frozen=True)
 class Seed:
-    """xyz (M, 3) float32 in the LiDAR frame, M >= 10; floor, the height of the ground under it,
-    and its own height above that, in metres. certain: a person or a label says that it is a
-    pedestrian."""
+    """A seed pedestrian.
+
+    xyz (M, 3) float32 are its points in the LiDAR frame, M >= 10; floor is z of the ground under
+    it, and height its own height above that, in metres. certain: a person or a label confirms that
+    it is a pedestrian.
+    """
 
     xyz: np.ndarray
     floor: float
@@ -32,13 +35,13 @@ class Seed:
     certain: bool = False
 
     def silhouette(self, params: PipelineParams = PipelineParams()) -> np.ndarray:
-        """(80,) uint32, see silhouette.py."""
-        return silhouettes(self.xyz, np.array([0, len(self.xyz)]), np.ones((1, 1)),
-                           np.array([self.floor]), params)[0]
+        """Draw the seed's silhouette, (80,) uint32 (see silhouette.py)."""
+        return draw_silhouettes(self.xyz, np.array([0, len(self.xyz)]), np.ones((1, 1)),
+                                np.array([self.floor]), params)[0]
 
 
 def seed_from_points(xyz: np.ndarray, box: np.ndarray, certain: bool = False) -> Seed:
-    """Seed of a pedestrian's points (M, 3), M >= 10, and box (7,), which stands on the ground."""
+    """Make a seed of a pedestrian's points (M, 3), M >= 10, and its box (7,) on the ground."""
     if len(xyz) < MIN_POINTS:
         raise InputError(f"the seed pedestrian has {len(xyz)} points; pick a nearer one "
                          f"(at least {MIN_POINTS})")
@@ -46,9 +49,12 @@ def seed_from_points(xyz: np.ndarray, box: np.ndarray, certain: bool = False) ->
                 certain)
 
 
-def own_cluster(seed: Seed, xyz: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """(K,) bool: the cluster that holds half of the seed's very points, or more. Clusters are rows
-    start[k]:start[k + 1] of xyz (N, 3) float32. In another frame than the seed's there is none."""
+def find_seed_cluster(seed: Seed, xyz: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return (K,) bool: True for a cluster that holds at least half of the seed's own points.
+
+    Cluster k has the rows start[k]:start[k + 1] of xyz (N, 3) float32. All are False in a frame
+    other than the seed's.
+    """
     row = np.dtype((np.void, 12))
     same = np.isin(np.ascontiguousarray(xyz, np.float32).view(row).ravel(),
                    np.ascontiguousarray(seed.xyz, np.float32).view(row).ravel())
@@ -57,8 +63,13 @@ def own_cluster(seed: Seed, xyz: np.ndarray, start: np.ndarray) -> np.ndarray:
 
 
 def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray) -> Seed:
-    """Seed of the nearest pedestrian box of (M, 7): its points that are not ground and its
-    height. The paper's protocol. InputError where there is no pedestrian or no point on it."""
+    """Make a seed of the nearest pedestrian of boxes (M, 7), the paper's protocol.
+
+    It has the box's height and the points in the box that are not ground.
+
+    Raises:
+        InputError: without a pedestrian, or with too few points on it.
+    """
     if len(pedestrians) == 0:
         raise InputError("no Pedestrian in the ground truth of this frame, so no seed")
     nearest = pedestrians[np.argmin(np.hypot(pedestrians[:, 0], pedestrians[:, 1]))]
@@ -67,19 +78,27 @@ def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray
 
 def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray,
                     radius: float) -> Seed:
-    """Seed of the cluster whose points (labels 1..K, ground-snapped boxes (K, 7)) come nearest to
-    click (3,). InputError as of clicked_cluster."""
-    label = clicked_cluster(click, xyz, labels, radius)
+    """Make a seed of the cluster nearest to click (3,).
+
+    Clusters have labels 1..K and ground-snapped boxes (K, 7). Raises InputError as
+    find_clicked_cluster does.
+    """
+    label = find_clicked_cluster(click, xyz, labels, radius)
     return seed_from_points(xyz[labels == label], boxes[label - 1], certain=True)
 
 
-def clicked_cluster(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray,
-                    radius: float) -> int:
-    """The label of the cluster whose points (N, 3), labels (N,) with 0 for none, come nearest to
-    click (3,). InputError where none is within radius, or the click is not finite."""
+def find_clicked_cluster(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray,
+                         radius: float) -> int:
+    """Return the label of the cluster with the point nearest to click (3,).
+
+    labels (N,) are those of points (N, 3), 0 for no cluster.
+
+    Raises:
+        InputError: if no cluster is within radius, or the click is not finite.
+    """
     click = np.asarray(click, np.float64)
     if not np.isfinite(click).all():
-        raise InputError("the clicked point has a coordinate that is no finite number; click again")
+        raise InputError("the clicked point has a coordinate that is not finite; click again")
     clustered = np.flatnonzero(labels)
     if len(clustered) == 0:
         raise InputError("a point was clicked but the cloud has no clusters")
@@ -92,22 +111,25 @@ def clicked_cluster(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray,
 
 
 def save_seed(seed: Seed, path: str | Path) -> None:
-    """Write a template as JSON: the points, and the silhouette drawn in characters for people."""
+    """Write a template as JSON: the points, and the silhouette as text for readers."""
     rows = ["".join(".#"[bit] for bit in row) for row in to_pixels(seed.silhouette()).astype(int)]
-    points = [[round(float(v), DIGITS) for v in p] for p in seed.xyz]
-    write_text(path, json.dumps({"height_m": round(seed.height, DIGITS),
-                                 "floor_m": round(seed.floor, DIGITS), "points_m": points,
+    points = [[round(float(v), DECIMALS) for v in p] for p in seed.xyz]
+    write_text(path, json.dumps({"height_m": round(seed.height, DECIMALS),
+                                 "floor_m": round(seed.floor, DECIMALS), "points_m": points,
                                  "silhouette": rows}, indent=1))
 
 
 def load_seed(path: str | Path = "") -> Seed:
-    """Read a template; an empty path gives the one that comes with the package (a simulated
-    pedestrian). InputError names the file and what is wrong with it."""
-    own = files("lidar_perception.candidates") / "pedestrian.json"
-    source = path or own
+    """Read a template; an empty path reads the package's own, a simulated pedestrian.
+
+    Raises:
+        InputError: naming the file and the error in it.
+    """
+    packaged = files("lidar_perception.candidates") / "pedestrian.json"
+    source = path or packaged
     try:
-        content = json.loads(read_text(path, MAX_BYTES) if path else own.read_text())
-        with np.errstate(over="ignore"):  # beyond float32 is inf
+        content = json.loads(read_text(path, MAX_TEMPLATE_BYTES) if path else packaged.read_text())
+        with np.errstate(over="ignore"):  # values beyond float32 become inf
             xyz = np.array(content["points_m"], np.float32)
         floor, height = float(content["floor_m"]), float(content["height_m"])
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:

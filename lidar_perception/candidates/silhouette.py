@@ -1,8 +1,7 @@
 """Silhouettes of clusters and their similarity: STM with CPA (paper A, Sections 3.6 and 3.7).
 
-A silhouette is (80,) uint32: 80 rows from top to bottom, 32 columns as the bits of a word, so
-that closing and dilation are a few shifts a row and the cosine of two binary images is a count
-of bits.
+A silhouette is (80,) uint32: 80 rows from top to bottom, and 32 columns as the bits of a word.
+Closing and dilation are a few shifts per row, and the cosine of two binary images counts bits.
 """
 
 from __future__ import annotations
@@ -13,37 +12,47 @@ from numba import njit
 from lidar_perception.candidates.params import CpaParams, PipelineParams, StmParams
 
 ROWS, COLUMNS = 80, 32  # the paper's window, Table 2
-HEIGHT, WIDTH = 2.4, 1.6  # metres, of the metric window
-FULL = np.uint64(0xFFFFFFFF)
-ONE, LAST = np.uint64(1), np.uint64(31)
+WINDOW_HEIGHT_M, WINDOW_WIDTH_M = 2.4, 1.6  # of the metric window
+FULL_ROW = np.uint64(0xFFFFFFFF)
+ONE, LAST_COLUMN = np.uint64(1), np.uint64(31)
 
 
-def silhouettes(xyz: np.ndarray, start: np.ndarray, scales: np.ndarray,
-                floors: np.ndarray | None = None, params: PipelineParams = PipelineParams()
-                ) -> np.ndarray:
-    """(K, 80) uint32 silhouettes of K clusters.
+def draw_silhouettes(xyz: np.ndarray, start: np.ndarray, scales: np.ndarray,
+                     floors: np.ndarray | None = None, params: PipelineParams = PipelineParams()
+                     ) -> np.ndarray:
+    """Draw the silhouettes of K clusters.
 
-    xyz (N, 3) float32 holds the clusters one after the other, cluster k in rows
-    start[k]:start[k+1] (at least one row each); scales (K, S) float64 are the contractions
-    a_k of its CPA copies, 1 for the points themselves (see cpa_scales); floors (K,) the height of
-    the ground under each, which only the metric window needs.
+    The steps are those of the paper, except where params.stm changes them: rotate about z so that
+    the cluster's widest direction in x-y becomes y (PCA, seen from the sensor, so that z stays up
+    and the result does not depend on the heading); add the copies contracted towards the centroid
+    in y-z; stretch the y-z extent to the window; close with 3 x 3; dilate with 3 x 3.
 
-    Step by step, as in the paper: turn about z so that the cluster's widest direction in x-y is y
-    (PCA, seen from the sensor, so z stays up and the result does not depend on the heading); add
-    the copies contracted towards the centroid in y-z; stretch the y-z extent to the window; close
-    with 3 x 3, dilate with 3 x 3. params.stm says what is done otherwise.
+    Args:
+        xyz: (N, 3) float32, cluster after cluster.
+        start: (K + 1,); cluster k has the rows start[k]:start[k + 1], at least one.
+        scales: (K, S) float64 contractions a_k of the CPA copies, 1 for the points themselves (see
+            compute_cpa_scales).
+        floors: (K,) z of the ground under each cluster, for the metric window only.
+
+    Returns:
+        (K, 80) uint32.
     """
     stm, cell = params.stm, params.resolution
     floors = np.zeros(len(start) - 1) if floors is None else floors
     half = np.radians([cell.azimuth_step, cell.elevation_step]) / 2 * stm.spread
-    return _silhouettes(np.ascontiguousarray(xyz, np.float32), np.asarray(start, np.int64), scales,
-                        np.asarray(floors, np.float64), stm.window == "metric", stm.axis == "pca",
-                        half, stm.dilations)
+    return _draw_silhouettes(np.ascontiguousarray(xyz, np.float32), np.asarray(start, np.int64),
+                             scales,
+                             np.asarray(floors, np.float64), stm.window == "metric",
+                             stm.axis == "pca",
+                             half, stm.dilations)
 
 
-def cpa_scales(ranges: np.ndarray, params: CpaParams) -> np.ndarray:
-    """(K, 1 + steps) float64: 1 for the cluster itself, then a_k = max(min_scale, 1 - k decrement)
-    where the horizontal range (K,) lies in [min_range, max_range), else 1 (no new points)."""
+def compute_cpa_scales(ranges: np.ndarray, params: CpaParams) -> np.ndarray:
+    """Compute the scales (K, 1 + steps) float64 of the CPA copies.
+
+    The first is 1, for the cluster itself. The others are a_k = max(min_scale, 1 - k decrement) if
+    the horizontal range (K,) is in [min_range, max_range), else 1, which adds no points.
+    """
     steps = np.arange(1 + params.steps)
     contracted = np.maximum(params.min_scale, 1.0 - steps * params.decrement)
     contracted[0] = 1.0
@@ -51,51 +60,54 @@ def cpa_scales(ranges: np.ndarray, params: CpaParams) -> np.ndarray:
     return np.where(inside[:, None], contracted, 1.0)
 
 
-def similarity(images: np.ndarray, template: np.ndarray, params: StmParams = StmParams()
-               ) -> np.ndarray:
-    """(K,) float64 cosine of binary images (K, 80) with a template (80,); 0 if either is blank.
-    params.shifts: the best one of the images moved sideways by up to so many columns.
-    params.seen_only: of the rows down to the last that both have."""
+def compute_similarity(images: np.ndarray, template: np.ndarray, params: StmParams = StmParams()
+                       ) -> np.ndarray:
+    """Return (K,) float64 cosine of binary images (K, 80) and a template (80,); 0 if one is blank.
+
+    params.shifts: the best cosine of the images shifted sideways by up to this many columns.
+    params.seen_only: only rows down to the last one that is set in both are compared.
+    """
     if params.seen_only and params.window == "metric":
         rows = np.arange(ROWS)
         last = np.minimum(ROWS - 1 - (images[:, ::-1] != 0).argmax(axis=1),
                           ROWS - 1 - (template[::-1] != 0).argmax())
-        seen = np.where(rows <= last[:, None], np.uint32(FULL), np.uint32(0))
+        seen = np.where(rows <= last[:, None], np.uint32(FULL_ROW), np.uint32(0))
         images, templates = images & seen, template & seen
     else:
         templates = template[None]
-    norm = np.sqrt(covered(images) * covered(templates).astype(float))
-    shared = covered(images & templates)
+    norm = np.sqrt(count_pixels(images) * count_pixels(templates).astype(float))
+    shared = count_pixels(images & templates)
     for columns in range(1, params.shifts + 1):
         for moved in (images << np.uint32(columns), images >> np.uint32(columns)):
-            shared = np.maximum(shared, covered(moved & templates))
+            shared = np.maximum(shared, count_pixels(moved & templates))
     return np.divide(shared, norm, out=np.zeros(len(images)), where=norm > 0)
 
 
 def to_pixels(image: np.ndarray) -> np.ndarray:
-    """(80, 32) bool of a silhouette (80,) uint32; row 0 on top, column 0 is bit 0."""
+    """Convert a silhouette (80,) uint32 to (80, 32) bool; row 0 is on top, column 0 is bit 0."""
     return (image[:, None] >> np.arange(COLUMNS, dtype=np.uint32) & 1).astype(bool)
 
 
 def from_pixels(pixels: np.ndarray) -> np.ndarray:
-    """(80,) uint32 of an (80, 32) bool image; the inverse of to_pixels."""
+    """Convert an (80, 32) bool image to (80,) uint32, the inverse of to_pixels."""
     weights = np.uint32(1) << np.arange(COLUMNS, dtype=np.uint32)
     return (pixels.astype(np.uint32) * weights).sum(axis=1, dtype=np.uint32)
 
 
-def covered(images: np.ndarray) -> np.ndarray:
-    """(K,) bits set in each image (K, 80) uint32."""
+def count_pixels(images: np.ndarray) -> np.ndarray:
+    """Return (K,) the number of bits set in each image (K, 80) uint32."""
     return np.unpackbits(images.view(np.uint8), axis=1).sum(axis=1, dtype=np.int64)
 
 
 @njit(cache=True)
-def _silhouettes(xyz, start, scales, floors, metric, upright, half, dilations):
+def _draw_silhouettes(xyz, start, scales, floors, metric, upright, half, dilations):
     images = np.zeros((len(start) - 1, ROWS), np.uint32)
     rows = np.empty(ROWS, np.uint64)
     for k in range(len(start) - 1):
         points = xyz[start[k]:start[k + 1]]
-        centre = _centroid(points)
-        lateral, vertical = _principal_axes(points, centre) if upright else _turned(points, centre)
+        centre = _find_centroid(points)
+        lateral, vertical = (_find_principal_axes(points, centre) if upright else
+                             _find_yaw_axes(points, centre))
         y, z = np.empty(len(points)), np.empty(len(points))
         for i in range(len(points)):
             y[i] = z[i] = 0.0
@@ -103,11 +115,12 @@ def _silhouettes(xyz, start, scales, floors, metric, upright, half, dilations):
                 y[i] += (points[i, j] - centre[j]) * lateral[j]
                 z[i] += (points[i, j] - centre[j]) * vertical[j]
         reach = half * np.hypot(centre[0], centre[1])
-        # The window: its left edge, its top, pixels a metre. The centroid is the origin of y and
-        # z, so a copy is a scaled cluster; as scales are at most 1, it reaches no farther.
+        # The window: its left edge, its top, pixels per metre. The centroid is the origin of y and
+        # z, so a copy is a scaled cluster; because scales are at most 1, it extends no farther.
         if metric:
-            left, top = (y.min() + y.max() - WIDTH) / 2, floors[k] + HEIGHT - centre[2]
-            per_y, per_z = COLUMNS / WIDTH, ROWS / HEIGHT
+            left = (y.min() + y.max() - WINDOW_WIDTH_M) / 2
+            top = floors[k] + WINDOW_HEIGHT_M - centre[2]
+            per_y, per_z = COLUMNS / WINDOW_WIDTH_M, ROWS / WINDOW_HEIGHT_M
         else:
             left, top = y.min() - reach[0], z.max() + reach[1]
             per_y = COLUMNS / max(y.max() + reach[0] - left, 1e-6)
@@ -133,16 +146,16 @@ def _draw(y, z, scales, metric, reach, left, top, per_y, per_z, rows):
             low = int(np.floor((top - scales[s] * z[i] + reach[1]) * per_z))
             if metric and (last < 0 or first >= COLUMNS or low < 0 or high >= ROWS):
                 continue
-            # Nothing is outside a stretched window; its far edges belong to the last pixels.
+            # No point is outside a stretched window; its far edges belong to the last pixels.
             first, last = min(max(first, 0), COLUMNS - 1), min(last, COLUMNS - 1)
             high = min(high, ROWS - 1)
-            bits = (FULL >> np.uint64(31 - last + first)) << np.uint64(first)
+            bits = (FULL_ROW >> np.uint64(31 - last + first)) << np.uint64(first)
             for row in range(max(high, 0), min(low, ROWS - 1) + 1):
                 rows[row] |= bits
 
 
 @njit(cache=True)
-def _centroid(points):
+def _find_centroid(points):
     mean = np.zeros(3)
     for p in points:
         for j in range(3):
@@ -151,8 +164,8 @@ def _centroid(points):
 
 
 @njit(cache=True)
-def _turned(points, centre):
-    """Unit vectors: the largest spread in x-y, pointing to the left as the sensor sees it; up."""
+def _find_yaw_axes(points, centre):
+    """Return unit vectors: the widest direction in x-y, to the left seen from the sensor; up."""
     xx, xy, yy = 0.0, 0.0, 0.0
     for p in points:
         dx, dy = p[0] - centre[0], p[1] - centre[1]
@@ -167,8 +180,8 @@ def _turned(points, centre):
 
 
 @njit(cache=True)
-def _principal_axes(points, centre):
-    """Unit vectors of the second largest and the largest spread, to the left and up."""
+def _find_principal_axes(points, centre):
+    """Return unit vectors of the second largest and the largest spread, to the left and up."""
     spread = np.zeros((3, 3))
     for p in points:
         for i in range(3):
@@ -185,8 +198,8 @@ def _principal_axes(points, centre):
 
 @njit(cache=True)
 def _dilate(rows):
-    """3 x 3; nothing comes in from outside the window."""
-    wide = (rows | (rows << ONE) | (rows >> ONE)) & FULL
+    """Dilate with 3 x 3; pixels outside the window count as not set."""
+    wide = (rows | (rows << ONE) | (rows >> ONE)) & FULL_ROW
     out = wide.copy()
     out[1:] |= wide[:-1]
     out[:-1] |= wide[1:]
@@ -195,8 +208,8 @@ def _dilate(rows):
 
 @njit(cache=True)
 def _erode(rows):
-    """3 x 3; outside counts as set, so the border of the window does not eat into the image."""
-    narrow = rows & ((rows << ONE) | ONE) & ((rows >> ONE) | (ONE << LAST))
+    """Erode with 3 x 3; pixels outside the window count as set, so its border does not erode."""
+    narrow = rows & ((rows << ONE) | ONE) & ((rows >> ONE) | (ONE << LAST_COLUMN))
     out = narrow.copy()
     out[1:] &= narrow[:-1]
     out[:-1] &= narrow[1:]

@@ -10,8 +10,8 @@ import click
 import numpy as np
 
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.pipeline import segment
-from lidar_perception.candidates.seed_sources import clicked_seed, truth_seed
+from lidar_perception.candidates.pipeline import segment_cloud
+from lidar_perception.candidates.seed_sources import make_click_source, make_truth_source
 from lidar_perception.candidates.seeds import save_seed
 from lidar_perception.candidates.silhouette import to_pixels
 from lidar_perception.cli.command import Command
@@ -48,9 +48,9 @@ def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, 
     camera = frame.camera()
     if camera is None:
         params = replace(params, view=ViewParams(enabled=False))
-    segmented = segment(frame.load(), camera, params)
-    source = (clicked_seed(np.array(at), params.seed) if at is not None
-              else truth_seed(pedestrians_of(frame, params.view.enabled)))
+    segmented = segment_cloud(frame.load(), camera, params)
+    source = (make_click_source(np.array(at), params.seed) if at is not None
+              else make_truth_source(pedestrians_of(frame, params.view.enabled)))
     template = source(segmented)
     save_seed(template, out)
     for row in to_pixels(template.silhouette(params))[::2]:

@@ -11,7 +11,7 @@ from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import SeedSource
-from lidar_perception.candidates.segmented import explain_nothing
+from lidar_perception.candidates.segmented_cloud import explain_nothing
 from lidar_perception.detectors.contract import Cloud, Found, accept
 from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.param_fields import with_values

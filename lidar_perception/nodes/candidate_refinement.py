@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.candidates.pipeline import refined
+from lidar_perception.candidates.pipeline import refine_segmented
 from lidar_perception.candidates.seed_sources import SeedSource
-from lidar_perception.candidates.segmented import Segmented, grounded_boxes
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud, fit_grounded_boxes
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes.inputs import SeedInput
 from lidar_perception.nodes.managed import ManagedNode
@@ -44,8 +44,8 @@ class CandidateRefinement(ManagedNode):
                                  "the clustering's output")
             ids, numbers = clusters
             ground = np.zeros(len(ids), bool) if ground is None else ground > 0
-            segmented = Segmented(indices, frame.xyz, ground, ids,
-                                  grounded_boxes(frame.xyz, ground, ids,
-                                                 self.params.boxes.shape), numbers)
+            segmented = SegmentedCloud(indices, frame.xyz, ground, ids,
+                                       fit_grounded_boxes(frame.xyz, ground, ids,
+                                                          self.params.boxes.shape), numbers)
             self.outputs.publish(msg.header, frame.xyz,
-                                 lambda: refined(segmented, source, self.params))
+                                 lambda: refine_segmented(segmented, source, self.params))

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.candidates.segmented import explain_nothing, grounded_boxes
+from lidar_perception.candidates.segmented_cloud import explain_nothing, fit_grounded_boxes
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.nodes.managed import ManagedNode
@@ -42,7 +42,7 @@ class Clustering(ManagedNode):
             ids = cluster_obstacles(frame.xyz, ground, self.params.clustering)
             self.points.publish(encode(add_columns(
                 msg, bag_message, cluster_id=spread(ids, indices, msg, "u4"))))
-        self.boxes.publish(msg.header, lambda: grounded_boxes(
+        self.boxes.publish(msg.header, lambda: fit_grounded_boxes(
             frame.xyz, ground, ids, self.params.boxes.shape))
         self.counts["clusters"] = int(ids.max(initial=0))
         if marked is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from lidar_perception.candidates.segmented import explain_nothing, points_in_view
+from lidar_perception.candidates.segmented_cloud import crop_to_view, explain_nothing
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.ground.threshold import compute_inlier_share, fit_plane
@@ -42,7 +42,7 @@ class GroundSegmentation(ManagedNode):
         with self.frame(to_ns(msg.header.stamp)):
             frame, usable, params = self.sensor.frame(msg)
             camera = self.camera.get(msg.header, params.view)
-            indices, seen = points_in_view(frame, camera, params.view)
+            indices, seen = crop_to_view(frame, camera, params.view)
             ground = segment_ground(seen, params.ground)
             indices = usable.take(indices)
             self.points.publish(encode(add_columns(

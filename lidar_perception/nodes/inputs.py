@@ -14,12 +14,12 @@ from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import SeedParams
 from lidar_perception.candidates.seed_sources import (
     SeedSource,
-    automatic_seed,
-    clicked_seed,
-    truth_seed,
+    make_automatic_source,
+    make_click_source,
+    make_truth_source,
 )
 from lidar_perception.candidates.seeds import Seed, load_seed
-from lidar_perception.candidates.segmented import Segmented
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.nodes.graph import relative
 from lidar_perception.nodes.runtime import (
     JUMP_NS,
@@ -186,9 +186,9 @@ class SeedInput:
             self.loaded = (self.params.file, load_seed(self.params.file))
         return self.loaded[1]
 
-    def _from_file(self, segmented: Segmented) -> Seed:
+    def _from_file(self, segmented: SegmentedCloud) -> Seed:
         template = self._template()
-        return template if self.params.source == "file" else automatic_seed(
+        return template if self.params.source == "file" else make_automatic_source(
             template, self.node.params)(segmented)
 
     def _on_truth(self, msg: Any) -> None:
@@ -208,13 +208,13 @@ class SeedInput:
         else:
             people = truth.of_class(PEDESTRIAN)
             level = self.node.transforms.placing(cloud.header).level
-            self.deliver(cloud, truth_seed(people if level is None
-                                           else moved_boxes(people, level)))
+            self.deliver(cloud, make_truth_source(people if level is None
+                                                  else moved_boxes(people, level)))
 
     def _on_click(self, msg: Any) -> None:
         self.click, self.clicked = msg, None
 
-    def _from_click(self, header: Any, segmented: Segmented) -> Seed:
+    def _from_click(self, header: Any, segmented: SegmentedCloud) -> Seed:
         if self.click is None:
             raise InputError("no seed yet: click a pedestrian (a PointStamped on "
                              f"{relative(CLICK)}, as RViz and Foxglove publish it)")
@@ -227,13 +227,13 @@ class SeedInput:
                                  f"'{header.frame_id}' ({error}); set that as the fixed frame and "
                                  "click again") from None
             point = moved_points(np.array([[p.x, p.y, p.z]]), pose)[0]
-            self.clicked = clicked_seed(point, self.params)(segmented)
+            self.clicked = make_click_source(point, self.params)(segmented)
             self.node.get_logger().info(f"seed taken at ({p.x:.1f}, {p.y:.1f}, {p.z:.1f}), height "
                                         f"{self.clicked.height:.2f} m")
         return self.clicked
 
 
 def _missing(reason: str) -> SeedSource:
-    def source(segmented: Segmented) -> Seed:
+    def source(segmented: SegmentedCloud) -> Seed:
         raise InputError(reason)
     return source

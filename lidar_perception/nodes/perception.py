@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from lidar_perception.candidates.params import STEPS, PipelineParams
-from lidar_perception.candidates.pipeline import refined, segment
+from lidar_perception.candidates.pipeline import refine_segmented, segment_cloud
 from lidar_perception.candidates.seed_sources import SeedSource
-from lidar_perception.candidates.segmented import explain_nothing
+from lidar_perception.candidates.segmented_cloud import explain_nothing
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes.inputs import CameraInput, SeedInput
 from lidar_perception.nodes.managed import ManagedNode
@@ -43,11 +43,11 @@ class Perception(ManagedNode):
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, usable, params = self.sensor.frame(msg)
-            segmented = segment(frame, self.camera.get(msg.header, params.view), params)
+            segmented = segment_cloud(frame, self.camera.get(msg.header, params.view), params)
             problem = (explain_nothing(len(frame), segmented.ground, segmented.cluster_ids)
                        or self.sensor.problem(frame, params))
             self.outputs.publish(msg.header, frame.xyz,
-                                 lambda: refined(segmented, source, params), problem)
+                                 lambda: refine_segmented(segmented, source, params), problem)
         indices = usable.take(segmented.indices)
         if self.points.get_subscription_count():
             self.points.publish(encode(add_columns(

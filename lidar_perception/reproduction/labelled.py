@@ -8,9 +8,9 @@ import numpy as np
 
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.pipeline import segment
+from lidar_perception.candidates.pipeline import segment_cloud
 from lidar_perception.candidates.seeds import Seed, seed_from_truth
-from lidar_perception.candidates.segmented import Segmented
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import points_in_box
@@ -42,10 +42,10 @@ class Labelled:
     def pedestrians(self) -> np.ndarray:
         return self.truth.of_class(PEDESTRIAN)
 
-    def segmented(self, params: PipelineParams, scan: LidarFrame | None = None) -> Segmented:
+    def segmented(self, params: PipelineParams, scan: LidarFrame | None = None) -> SegmentedCloud:
         """The frame, or another scan of the same sensor, up to the boxes."""
-        return segment(self.frame if scan is None else scan, self.camera,
-                       set_sensor_height(params, self.height))
+        return segment_cloud(self.frame if scan is None else scan, self.camera,
+                             set_sensor_height(params, self.height))
 
 
 def load_labelled(frame: Frame) -> Labelled:
@@ -68,7 +68,7 @@ def load_labelled(frame: Frame) -> Labelled:
     return Labelled(scan, camera, truth, frame.sensor_height)
 
 
-def nearest_seed(segmented: Segmented, labelled: Labelled) -> Seed:
+def nearest_seed(segmented: SegmentedCloud, labelled: Labelled) -> Seed:
     """The seed of the paper's protocol: the nearest labelled pedestrian. InputError where it has
     too few points, or is on a vehicle, whose points would make the template."""
     pedestrians = labelled.pedestrians

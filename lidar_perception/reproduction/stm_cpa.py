@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.candidates.boxes import height_matches, snap_to_ground
+from lidar_perception.candidates.boxes import select_by_height, snap_to_ground
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.refine import STAGES, Candidates, refine
+from lidar_perception.candidates.refine import STAGES, Candidates, refine_clusters
 from lidar_perception.candidates.seeds import Seed
-from lidar_perception.candidates.segmented import Segmented
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.data.frame import Frame
@@ -82,7 +82,8 @@ def cpa_everywhere(steps: int) -> PipelineParams:
                                   "cpa.max_range": NUMBERS.cpa_max_range})
 
 
-def search(segmented: Segmented, seed: Seed | None, truth: np.ndarray) -> list[list[list[int]]]:
+def search(segmented: SegmentedCloud, seed: Seed | None,
+           truth: np.ndarray) -> list[list[list[int]]]:
     """True and false positives by range of the clusters of the seed's height, for each eps and
     each min_samples: eps in all bands of range, which are clustered one by one as in the paper.
 
@@ -100,14 +101,14 @@ def search(segmented: Segmented, seed: Seed | None, truth: np.ndarray) -> list[l
     return counts
 
 
-def _clusters(segmented: Segmented, plane: np.ndarray | None, seed: Seed, eps: float,
+def _clusters(segmented: SegmentedCloud, plane: np.ndarray | None, seed: Seed, eps: float,
               min_samples: int) -> np.ndarray:
     bands = len(PAPER.clustering.dbscan.eps)
     params = with_values(PAPER, {"clustering.dbscan.eps": (eps,) * bands,
                                     "clustering.dbscan.min_samples": min_samples})
     ids = cluster_obstacles(segmented.xyz, segmented.ground, params.clustering)
     boxes = snap_to_ground(fit_boxes(segmented.xyz, ids, params.boxes.shape), plane)
-    return boxes[height_matches(boxes, seed.height, params.height)]
+    return boxes[select_by_height(boxes, seed.height, params.height)]
 
 
 def stage_counts(found: np.ndarray, truth: np.ndarray, before: np.ndarray) -> dict[str, list]:
@@ -131,8 +132,8 @@ def overlaps(found: np.ndarray, truth: np.ndarray) -> list[float]:
             round(float(space.sum()), 6), round(float(bev.sum()), 6)]
 
 
-def _refined(segmented: Segmented, seed: Seed, params: PipelineParams) -> Candidates:
-    return refine(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed, params)
+def _refined(segmented: SegmentedCloud, seed: Seed, params: PipelineParams) -> Candidates:
+    return refine_clusters(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed, params)
 
 
 def _by_range(boxes: np.ndarray) -> list[int]:

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidar_perception.candidates.boxes import height_matches
+from lidar_perception.candidates.boxes import select_by_height
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.pipeline import refined
-from lidar_perception.candidates.seed_sources import automatic_seed
+from lidar_perception.candidates.pipeline import refine_segmented
+from lidar_perception.candidates.seed_sources import make_automatic_source
 from lidar_perception.candidates.seeds import Seed, load_seed
-from lidar_perception.candidates.segmented import Segmented
-from lidar_perception.candidates.silhouette import cpa_scales, silhouettes
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud
+from lidar_perception.candidates.silhouette import compute_cpa_scales, draw_silhouettes
 from lidar_perception.data.frame import Frame
 from lidar_perception.groups import group_points
 from lidar_perception.param_fields import flatten, with_values
@@ -59,7 +59,7 @@ class Found(NamedTuple):
 NOTHING = Found(np.zeros((0, 7), np.float32), np.zeros(0), 0.0)
 
 # What a study does with a frame: what each of its variants finds.
-Finder = Callable[[Labelled, Callable[[PipelineParams], Segmented]], dict[str, Found]]
+Finder = Callable[[Labelled, Callable[[PipelineParams], SegmentedCloud]], dict[str, Found]]
 
 
 def compared_variants(name: str, title: str, question: str, variants: Mapping[str, PipelineParams]
@@ -105,11 +105,11 @@ def ranked(boxes: np.ndarray, scores: np.ndarray, truth: np.ndarray) -> list[lis
     return [[round(float(s), 4), int(h)] for s, h in zip(scores, hits)]
 
 
-def segments_of(labelled: Labelled) -> Callable[[PipelineParams], Segmented]:
+def segments_of(labelled: Labelled) -> Callable[[PipelineParams], SegmentedCloud]:
     """Segments the frame for given settings, and remembers what was done for the same ones."""
-    done: dict[tuple, Segmented] = {}
+    done: dict[tuple, SegmentedCloud] = {}
 
-    def segments(params: PipelineParams) -> Segmented:
+    def segments(params: PipelineParams) -> SegmentedCloud:
         key = (params.view, params.ground, params.clustering, params.boxes)
         if key not in done:
             done[key] = labelled.segmented(params)
@@ -118,31 +118,32 @@ def segments_of(labelled: Labelled) -> Callable[[PipelineParams], Segmented]:
     return segments
 
 
-def seed_of(segmented: Segmented, labelled: Labelled, params: PipelineParams) -> Seed:
+def seed_of(segmented: SegmentedCloud, labelled: Labelled, params: PipelineParams) -> Seed:
     """The seed from the source that params names. InputError where there is none."""
     if params.seed.source == "ground_truth":
         return nearest_seed(segmented, labelled)
     template = load_seed(params.seed.file)
     if params.seed.source == "automatic":
-        return automatic_seed(template, params)(segmented)
+        return make_automatic_source(template, params)(segmented)
     return template
 
 
-def found_with(segmented: Segmented, seed: Callable[[], Seed], params: PipelineParams) -> Found:
+def found_with(segmented: SegmentedCloud, seed: Callable[[], Seed],
+               params: PipelineParams) -> Found:
     """The candidates of the last stage; none where there is no seed."""
     try:
-        all_ = refined(segmented, lambda _: seed(), with_values(params, ANY_SCORE)).final
+        all_ = refine_segmented(segmented, lambda _: seed(), with_values(params, ANY_SCORE)).final
     except InputError:
         return NOTHING
     return Found(all_.boxes, all_.scores, (params.confidence if params.confidence.enabled
                                            else params.stm).threshold)
 
 
-def clusters_as_tall(segmented: Segmented, seeds: Sequence[Seed], params: PipelineParams
+def clusters_as_tall(segmented: SegmentedCloud, seeds: Sequence[Seed], params: PipelineParams
                      ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """boxes (K, 7) of the clusters whose height is that of one of the seeds, and their points
     (N, 3) and start (K + 1,) as silhouettes() takes them."""
-    tall = [height_matches(segmented.boxes, seed.height, params.height) for seed in seeds]
+    tall = [select_by_height(segmented.boxes, seed.height, params.height) for seed in seeds]
     kept = np.flatnonzero(np.any(tall, axis=0))
     return segmented.boxes[kept], *group_points(segmented.xyz, segmented.cluster_ids, kept + 1)
 
@@ -150,12 +151,12 @@ def clusters_as_tall(segmented: Segmented, seeds: Sequence[Seed], params: Pipeli
 def with_copies(boxes: np.ndarray, points: np.ndarray, start: np.ndarray, params: PipelineParams
                 ) -> np.ndarray:
     """(K, 80) silhouettes of such clusters with CPA as params has it."""
-    scales = cpa_scales(np.hypot(boxes[:, 0], boxes[:, 1]), params.cpa)
-    return silhouettes(points, start, scales, boxes[:, 2] - boxes[:, 5] / 2, params)
+    scales = compute_cpa_scales(np.hypot(boxes[:, 0], boxes[:, 1]), params.cpa)
+    return draw_silhouettes(points, start, scales, boxes[:, 2] - boxes[:, 5] / 2, params)
 
 
 def by_settings(variants: Mapping[str, PipelineParams], labelled: Labelled,
-                segments: Callable[[PipelineParams], Segmented]) -> dict[str, Found]:
+                segments: Callable[[PipelineParams], SegmentedCloud]) -> dict[str, Found]:
     """What each of the settings finds."""
     found = {}
     for name, params in variants.items():

@@ -1,4 +1,4 @@
-"""Laws of candidates: boxes on the ground, the height filter, and refinement by a seed."""
+"""Candidates: boxes snapped to the ground, the height filter, and refinement by a seed."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
 
-from lidar_perception.candidates.boxes import height_matches, snap_to_ground
+from lidar_perception.candidates.boxes import select_by_height, snap_to_ground
 from lidar_perception.candidates.params import HeightParams, PipelineParams, SeedParams, StmParams
-from lidar_perception.candidates.pipeline import find_candidates, refined, segment
-from lidar_perception.candidates.refine import refine
-from lidar_perception.candidates.seed_sources import clicked_seed, fixed_seed, truth_seed
+from lidar_perception.candidates.pipeline import find_candidates, refine_segmented, segment_cloud
+from lidar_perception.candidates.refine import refine_clusters
+from lidar_perception.candidates.seed_sources import (
+    make_click_source,
+    make_fixed_source,
+    make_truth_source,
+)
 from lidar_perception.candidates.seeds import Seed, seed_from_points
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.data.open import open_recording
@@ -22,8 +26,8 @@ from lidar_perception.types import PEDESTRIAN, InputError, LidarFrame
 seeds = st.integers(0, 2**32 - 1)
 
 
-def labelled(seed):
-    """Random points with ids 0..K, every cluster with at least one point."""
+def make_labelled_points(seed):
+    """Return random points with ids 0..K, where every cluster has at least one point."""
     rng = np.random.default_rng(seed)
     count = rng.integers(1, 8)
     labels = np.concatenate([np.arange(1, count + 1), rng.integers(0, count + 1, 60)])
@@ -32,8 +36,8 @@ def labelled(seed):
 
 
 @given(seeds, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-20, 20))
-def test_snapping_lowers_bottoms_to_the_plane_never_raises_them_and_keeps_tops(seed, a, b, c):
-    boxes = fit_boxes(*labelled(seed), "axis_aligned")
+def test_snapping_lowers_bottoms_to_the_plane_and_keeps_tops(seed, a, b, c):
+    boxes = fit_boxes(*make_labelled_points(seed), "axis_aligned")
     before = boxes.copy()
     snapped = snap_to_ground(boxes, np.array([a, b, c]))
     assert snapped.dtype == np.float32
@@ -43,29 +47,29 @@ def test_snapping_lowers_bottoms_to_the_plane_never_raises_them_and_keeps_tops(s
     np.testing.assert_allclose(snapped[:, 2] - snapped[:, 5] / 2, np.minimum(bottom, ground),
                                rtol=0, atol=2e-5)
     np.testing.assert_array_equal(snapped[:, [0, 1, 3, 4, 6]], before[:, [0, 1, 3, 4, 6]])
-    np.testing.assert_array_equal(boxes, before)  # the input is not touched
+    np.testing.assert_array_equal(boxes, before)  # the input is not modified
     np.testing.assert_array_equal(snap_to_ground(boxes, None), before)
     np.testing.assert_allclose(snap_to_ground(snapped, np.array([a, b, c])), snapped, rtol=0,
                                atol=2e-5)
 
 
-def test_the_height_filter_keeps_what_differs_at_most_the_tolerance():
+def test_the_height_filter_includes_the_tolerance():
     boxes = np.zeros((5, 7), np.float32)
     boxes[:, 5] = [1.25, 1.5, 1.75, 2.0, 2.25]
-    assert height_matches(boxes, 1.75, HeightParams(tolerance=0.25)).tolist() == [
+    assert select_by_height(boxes, 1.75, HeightParams(tolerance=0.25)).tolist() == [
         False, True, True, True, False]
-    assert height_matches(boxes, 1.75, HeightParams(tolerance=0.0)).tolist() == [
+    assert select_by_height(boxes, 1.75, HeightParams(tolerance=0.0)).tolist() == [
         False, False, True, False, False]
 
 
 @given(seeds)
-def test_group_points_lists_the_wanted_clusters_in_the_order_asked_for(seed):
-    xyz, labels = labelled(seed)
+def test_group_points_keeps_the_given_order_of_clusters(seed):
+    xyz, labels = make_labelled_points(seed)
     rng = np.random.default_rng(seed)
     wanted = rng.permutation(np.arange(1, labels.max() + 1))[:rng.integers(0, labels.max() + 1)]
     points, start = group_points(xyz, labels, wanted)
     assert len(start) == len(wanted) + 1 and start[0] == 0 and start[-1] == len(points)
-    for i, k in enumerate(wanted):  # the points of each in the order of the input
+    for i, k in enumerate(wanted):  # each cluster's points are in the order of the input
         np.testing.assert_array_equal(points[start[i]:start[i + 1]], xyz[labels == k])
 
 
@@ -77,13 +81,13 @@ def with_threshold(threshold):
     return PipelineParams(stm=StmParams(threshold=threshold))
 
 
-def test_the_later_stages_are_subsets_of_the_first_and_it_of_the_clusters():
-    s = segment(LidarFrame(scene()))
-    seed = truth_seed(boxes_at(PEOPLE))(s)
-    tall = height_matches(s.boxes, seed.height, HeightParams())
+def test_stages_are_subsets_of_the_first_stage():
+    s = segment_cloud(LidarFrame(scene()))
+    seed = make_truth_source(boxes_at(PEOPLE))(s)
+    tall = select_by_height(s.boxes, seed.height, HeightParams())
     assert 3 < tall.sum() < len(s.boxes)
     for threshold in (0.0, 0.4, 0.7, 0.9, 1.0):
-        found = refined(s, fixed_seed(seed), with_threshold(threshold))
+        found = refine_segmented(s, make_fixed_source(seed), with_threshold(threshold))
         assert rows(found.stage1) == {tuple(box) for box in s.boxes[tall].tolist()}
         assert rows(found.stage2) <= rows(found.stage1)
         assert rows(found.final) <= rows(found.stage1)
@@ -92,43 +96,43 @@ def test_the_later_stages_are_subsets_of_the_first_and_it_of_the_clusters():
             assert (stage.class_ids == PEDESTRIAN).all()
 
 
-def test_at_threshold_0_every_stage_1_cluster_passes_and_at_1_the_seed_does():
-    s = segment(LidarFrame(scene()))
+def test_threshold_0_accepts_every_cluster_and_1_only_the_seed():
+    s = segment_cloud(LidarFrame(scene()))
     k = s.cluster_ids[np.argmin(np.linalg.norm(s.xyz - [7, 2, -1], axis=1))]
     own = seed_from_points(s.xyz[s.cluster_ids == k], s.boxes[k - 1])
-    everything = refined(s, fixed_seed(own), with_threshold(0.0))
+    everything = refine_segmented(s, make_fixed_source(own), with_threshold(0.0))
     assert rows(everything.stage2) == rows(everything.final) == rows(everything.stage1)
-    exact = refined(s, fixed_seed(own), with_threshold(1.0))
+    exact = refine_segmented(s, make_fixed_source(own), with_threshold(1.0))
     for stage in (exact.stage2, exact.final):
         assert rows(stage) == {tuple(s.boxes[k - 1].tolist())}
         assert stage.scores.tolist() == [1.0]
 
 
-def test_only_clusters_of_15_to_30_metres_change_their_score_by_augmentation():
-    s = segment(LidarFrame(scene()))
-    found = refined(s, truth_seed(boxes_at(PEOPLE)), with_threshold(0.0))
+def test_augmentation_changes_scores_from_15_to_30_metres_only():
+    s = segment_cloud(LidarFrame(scene()))
+    found = refine_segmented(s, make_truth_source(boxes_at(PEOPLE)), with_threshold(0.0))
     np.testing.assert_array_equal(found.final.boxes, found.stage1.boxes)
     ranges = np.hypot(*found.final.boxes[:, :2].T)
     differs = found.final.scores != found.stage1.scores
     assert differs.any() and not differs[(ranges < 15) | (ranges >= 30)].any()
 
 
-def test_a_threshold_cuts_each_stage_by_the_stages_own_scores():
-    s = segment(LidarFrame(scene()))
-    seed = fixed_seed(truth_seed(boxes_at(PEOPLE))(s))
-    everything = refined(s, seed, with_threshold(0.0))
+def test_the_threshold_applies_to_each_stages_own_scores():
+    s = segment_cloud(LidarFrame(scene()))
+    seed = make_fixed_source(make_truth_source(boxes_at(PEOPLE))(s))
+    everything = refine_segmented(s, seed, with_threshold(0.0))
     assert (everything.final.scores != everything.stage2.scores).any()
     scores = np.unique(np.concatenate([everything.stage2.scores, everything.final.scores]))
     scores = scores[np.diff(scores, prepend=0) > 1e-4].astype(float)
     for threshold in (scores[1:] + scores[:-1]) / 2:
-        found = refined(s, seed, with_threshold(float(threshold)))
+        found = refine_segmented(s, seed, with_threshold(float(threshold)))
         for name in ("stage2", "final"):
-            stage, all_of_it = getattr(found, name), getattr(everything, name)
-            assert rows(stage) == rows(all_of_it[all_of_it.scores >= threshold])
+            stage, unfiltered = getattr(found, name), getattr(everything, name)
+            assert rows(stage) == rows(unfiltered[unfiltered.scores >= threshold])
 
 
-def test_the_people_are_found_and_the_rest_is_not():
-    _, found = find_candidates(LidarFrame(scene()), truth_seed(boxes_at(PEOPLE)),
+def test_people_are_found_and_other_objects_are_not():
+    _, found = find_candidates(LidarFrame(scene()), make_truth_source(boxes_at(PEOPLE)),
                                params=with_threshold(0.75))
     order = np.argsort(found.final.boxes[:, 0])
     np.testing.assert_allclose(found.final.boxes[order, :2], PEOPLE + [0.05, 0], atol=0.1)
@@ -136,45 +140,45 @@ def test_the_people_are_found_and_the_rest_is_not():
     np.testing.assert_allclose(bottoms, GROUND_Z, atol=0.02)
 
 
-def test_refining_without_clusters_finds_none():
+def test_refining_without_clusters_finds_no_candidates():
     seed = Seed(person(7, 2).astype(np.float32), -1.7, 1.7)
     xyz = np.ones((5, 3), np.float32)
-    found = refine(xyz, np.zeros(5, np.int32), np.zeros((0, 7), np.float32), seed)
+    found = refine_clusters(xyz, np.zeros(5, np.int32), np.zeros((0, 7), np.float32), seed)
     for stage in (found.stage1, found.stage2, found.final):
         assert stage.boxes.shape == (0, 7) and stage.scores.shape == (0,)
     assert set(found.ms) == {"height", "stm", "cpa", "confidence"}
 
 
 @needs_data
-def test_on_a_real_frame_the_seeds_own_cluster_passes_every_stage():
+def test_the_seeds_own_cluster_passes_every_stage():
     checked = 0
     for frame in open_recording(DATA / "kitti_object").frames[:12]:
         truth = frame.truth().of_class(PEDESTRIAN)
         if len(truth) == 0:
             continue
-        s = segment(frame.load())
-        click = clicked_seed(truth[np.hypot(*truth[:, :2].T).argmin(), :3], SeedParams())
+        s = segment_cloud(frame.load())
+        click = make_click_source(truth[np.hypot(*truth[:, :2].T).argmin(), :3], SeedParams())
         try:
             seed = click(s)
         except InputError:
             continue
-        found = refined(s, click, PipelineParams())
+        found = refine_segmented(s, click, PipelineParams())
         assert seed.height in found.stage2.boxes[:, 5] and found.stage2.scores.max() == 1.0
         assert rows(found.stage2) | rows(found.final) <= rows(found.stage1)
         checked += 1
     assert checked > 0
 
 
-def test_candidates_keep_the_numbers_that_a_foreign_clustering_gave():
-    """Gaps, giants: the candidates are those of 1..K, under the cloud's numbers."""
+def test_candidates_keep_the_ids_of_a_foreign_clustering():
+    """Ids may have gaps and be huge; the candidates are the same as for 1..K."""
     frame = LidarFrame(scene())
-    s = segment(frame)
+    s = segment_cloud(frame)
     k = len(s.boxes)
-    source = fixed_seed(seed_from_points(s.xyz[s.cluster_ids == 1], s.boxes[0]))
-    expected = refined(s, source)
+    source = make_fixed_source(seed_from_points(s.xyz[s.cluster_ids == 1], s.boxes[0]))
+    expected = refine_segmented(s, source)
     assert len(expected.final) > 1
     for foreign in (np.arange(1, k + 1) * 2 + 1, np.arange(k) * 10_000_000 + 2**31):
         ids = np.concatenate([[0], foreign])[s.cluster_ids].astype(np.uint32)
-        found = refined(segment(frame, ground=s.ground, cluster_ids=ids), source)
+        found = refine_segmented(segment_cloud(frame, ground=s.ground, cluster_ids=ids), source)
         np.testing.assert_array_equal(found.final.boxes, expected.final.boxes)
         np.testing.assert_array_equal(found.clusters, foreign[expected.clusters - 1])

@@ -1,4 +1,4 @@
-"""Laws of what `best` adds: silhouettes in metres, confidence, automatic seeds."""
+"""The parts that `best` adds: metric silhouettes, confidence and automatic seeds."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from samples import DATA, needs_data
 from lidar_perception.candidates.confidence import (
     SEED_KNOTS,
     SHAPE_KNOTS,
-    _models,
-    confidence,
-    shape_features,
+    _load_models,
+    compute_confidence,
+    compute_shape_features,
 )
 from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.params import PipelineParams, StmParams
-from lidar_perception.candidates.pipeline import refined, segment
-from lidar_perception.candidates.refine import refine
-from lidar_perception.candidates.seed_sources import automatic_seed, truth_seed
-from lidar_perception.candidates.seeds import load_seed, own_cluster, seed_from_points
+from lidar_perception.candidates.pipeline import refine_segmented, segment_cloud
+from lidar_perception.candidates.refine import refine_clusters
+from lidar_perception.candidates.seed_sources import make_automatic_source, make_truth_source
+from lidar_perception.candidates.seeds import find_seed_cluster, load_seed, seed_from_points
 from lidar_perception.candidates.silhouette import (
     COLUMNS,
-    HEIGHT,
     ROWS,
-    WIDTH,
+    WINDOW_HEIGHT_M,
+    WINDOW_WIDTH_M,
+    compute_similarity,
+    draw_silhouettes,
     from_pixels,
-    silhouettes,
-    similarity,
     to_pixels,
 )
 from lidar_perception.data.open import open_recording
@@ -44,44 +44,48 @@ FLOOR = -1.7
 STEP = np.radians([METRIC.resolution.azimuth_step, METRIC.resolution.elevation_step])
 
 
-def board(far, width=0.5, height=1.7, bearing=0.0, offset=0.3):
-    """Points of an upright board, as a sensor with METRIC's resolution sees it from far metres."""
-    y = (np.arange(-width / 2, width / 2, far * STEP[0])[:, None] + offset * far * STEP[0])
-    z = FLOOR + np.arange(0, height, far * STEP[1])[None] + offset * far * STEP[1]
+def board(distance, width=0.5, height=1.7, bearing=0.0, offset=0.3):
+    """Return points of an upright board at this distance, sampled with METRIC's resolution."""
+    step = distance * STEP
+    y = (np.arange(-width / 2, width / 2, step[0])[:, None] + offset * step[0])
+    z = FLOOR + np.arange(0, height, step[1])[None] + offset * step[1]
     y, z = (a.ravel() for a in np.broadcast_arrays(y, z))
     keep = (np.abs(y) <= width / 2) & (z <= FLOOR + height)
     cos, sin = np.cos(bearing), np.sin(bearing)
-    return np.stack([far * cos - y * sin, far * sin + y * cos, z], 1)[keep].astype(np.float32)
+    xyz = np.stack([distance * cos - y * sin, distance * sin + y * cos, z], 1)
+    return xyz[keep].astype(np.float32)
 
 
 def draw(xyz, params=METRIC, floor=FLOOR):
-    return silhouettes(xyz, np.array([0, len(xyz)]), np.ones((1, 1)), np.array([floor]), params)[0]
+    return draw_silhouettes(xyz, np.array([0, len(xyz)]), np.ones((1, 1)), np.array([floor]),
+                            params)[0]
 
 
-def box_of(far, width=0.5, height=1.7):
-    return np.array([[far, 0, FLOOR + height / 2, 0.3, width, height, 0]], np.float32)
+def make_box(distance, width=0.5, height=1.7):
+    return np.array([[distance, 0, FLOOR + height / 2, 0.3, width, height, 0]], np.float32)
 
 
-# --- silhouettes in metres -----------------------------------------------------------------
+# --- metric silhouettes --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("far", [6.0, 15.0, 30.0])
+@pytest.mark.parametrize("distance", [6.0, 15.0, 30.0])
 @pytest.mark.parametrize("width, height", [(0.5, 1.7), (0.9, 1.2), (1.2, 2.2)])
-def test_a_board_covers_its_size_wherever_it_is(far, width, height):
-    pixels = to_pixels(draw(board(far, width, height)))
+def test_a_board_has_its_size_at_every_range(distance, width, height):
+    pixels = to_pixels(draw(board(distance, width, height)))
     rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
-    cell = far * STEP
-    assert np.ptp(columns) + 1 == pytest.approx(width / WIDTH * COLUMNS, abs=2 + cell[0] * 20)
-    assert np.ptp(rows) + 1 == pytest.approx(height / HEIGHT * ROWS,
-                                             abs=2 + cell[1] / HEIGHT * ROWS)
-    assert pixels[np.ix_(rows, columns)].mean() > 0.99  # no stripes
+    cell = distance * STEP
+    assert np.ptp(columns) + 1 == pytest.approx(width / WINDOW_WIDTH_M * COLUMNS,
+                                                abs=2 + cell[0] * 20)
+    assert np.ptp(rows) + 1 == pytest.approx(height / WINDOW_HEIGHT_M * ROWS,
+                                             abs=2 + cell[1] / WINDOW_HEIGHT_M * ROWS)
+    assert pixels[np.ix_(rows, columns)].mean() > 0.99  # no gaps
 
 
-def test_spread_points_make_near_and_far_alike_where_bare_points_do_not():
+def test_spread_makes_silhouettes_independent_of_the_range():
     near, far = board(7.0), board(26.0)
     bare = PipelineParams()
-    assert similarity(draw(far, bare)[None], draw(near, bare))[0] < 0.75
-    assert similarity(draw(far)[None], draw(near))[0] > 0.9
+    assert compute_similarity(draw(far, bare)[None], draw(near, bare))[0] < 0.75
+    assert compute_similarity(draw(far)[None], draw(near))[0] > 0.9
 
 
 @given(seeds)
@@ -90,21 +94,21 @@ def test_a_metric_silhouette_moves_with_the_ground(seed):
     xyz = board(rng.uniform(5, 30), bearing=0.0) + rng.normal(0, 0.02, (1, 3)).astype(np.float32)
     up = np.float32(rng.integers(-8, 8) / 4)  # exact in float32
     moved = xyz + np.float32([0, 0, up])
-    shared = similarity(draw(moved, floor=FLOOR + float(up))[None], draw(xyz))[0]
+    shared = compute_similarity(draw(moved, floor=FLOOR + float(up))[None], draw(xyz))[0]
     assert shared > 0.97
 
 
-def test_what_is_outside_the_window_is_not_drawn():
+def test_points_outside_the_window_are_not_drawn():
     inside, tall = board(10.0), board(10.0, height=4.0)
     assert to_pixels(draw(tall))[0].any()
-    above = tall[tall[:, 2] > FLOOR + HEIGHT + 0.2]
+    above = tall[tall[:, 2] > FLOOR + WINDOW_HEIGHT_M + 0.2]
     assert not draw(above).any()
     both = draw(np.concatenate([inside, inside + np.float32([0, 0, 3.0])]))
     np.testing.assert_array_equal(both, draw(inside))
 
 
 @given(seeds, st.integers(0, 6))
-def test_shifts_take_the_best_of_the_moved_images(seed, shifts):
+def test_shifts_take_the_best_of_the_shifted_images(seed, shifts):
     rng = np.random.default_rng(seed)
     pixels, template = (rng.random((ROWS, COLUMNS)) < 0.2 for _ in range(2))
     best = 0.0
@@ -115,22 +119,24 @@ def test_shifts_take_the_best_of_the_moved_images(seed, shifts):
         else:
             moved[:, :columns] = pixels[:, -columns:]
         best = max(best, (moved & template).sum() / np.sqrt(pixels.sum() * template.sum()))
-    found = similarity(from_pixels(pixels)[None], from_pixels(template), StmParams(shifts=shifts))
+    found = compute_similarity(from_pixels(pixels)[None], from_pixels(template),
+                               StmParams(shifts=shifts))
     assert found[0] == pytest.approx(best, abs=1e-12)
 
 
-def test_hidden_legs_do_not_matter_where_only_what_is_seen_is_compared():
+def test_hidden_legs_do_not_matter_with_seen_only():
     whole = board(12.0, width=0.4)
     legs = whole[:, 2] < FLOOR + 0.8
-    head = np.concatenate([whole[~legs], board(12.0, 0.4, 1.7)[:0]])
+    head = whole[~legs]
     seen = with_values(METRIC, {"stm.seen_only": True})
-    alike = [similarity(draw(head)[None], draw(whole), params.stm)[0] for params in (METRIC, seen)]
+    alike = [compute_similarity(draw(head)[None], draw(whole), params.stm)[0]
+             for params in (METRIC, seen)]
     assert alike[0] < 0.85 and alike[1] > 0.99
-    again = similarity(draw(whole)[None], draw(head), seen.stm)[0]
+    again = compute_similarity(draw(whole)[None], draw(head), seen.stm)[0]
     assert again == pytest.approx(alike[1], abs=1e-12)  # whichever of the two is hidden
 
 
-def test_principal_axes_undo_a_tilt_and_yaw_does_not():
+def test_pca_axis_corrects_a_tilt_and_yaw_does_not():
     rng = np.random.default_rng(0)
     upright = rng.normal(size=(600, 3)) * [0.05, 0.2, 0.6] + [10, 0, 0]
     angle = 0.5
@@ -139,11 +145,11 @@ def test_principal_axes_undo_a_tilt_and_yaw_does_not():
     tilted = (upright - [10, 0, 0]) @ tilt.T + [10, 0, 0]
     images = {axis: [draw(xyz.astype(np.float32), with_values(PipelineParams(), {"stm.axis": axis}))
                      for xyz in (upright, tilted)] for axis in ("yaw", "pca")}
-    alike = {axis: similarity(a[None], b)[0] for axis, (a, b) in images.items()}
+    alike = {axis: compute_similarity(a[None], b)[0] for axis, (a, b) in images.items()}
     assert alike["pca"] > 0.97 > 0.9 > alike["yaw"]
 
 
-def test_every_dilation_adds_a_border():
+def test_every_dilation_adds_pixels():
     xyz = board(15.0)
     images = [to_pixels(draw(xyz, with_values(PipelineParams(), {"stm.dilations": n})))
               for n in range(4)]
@@ -156,11 +162,12 @@ def test_every_dilation_adds_a_border():
 
 def features_of(clusters, boxes):
     start = np.cumsum([0] + [len(c) for c in clusters])
-    return shape_features(np.concatenate(clusters), start, np.concatenate(boxes), BEST)
+    return compute_shape_features(np.concatenate(clusters), start, np.concatenate(boxes), BEST)
 
 
-def test_features_of_a_board_are_its_measures():
-    shape = {k: v[0] for k, v in features_of([board(12.0, 0.6, 1.7)], [box_of(12.0, 0.6)]).items()}
+def test_features_of_a_board_are_its_dimensions():
+    shape = {k: v[0] for k,
+             v in features_of([board(12.0, 0.6, 1.7)], [make_box(12.0, 0.6)]).items()}
     assert set(shape) == set(SHAPE_KNOTS)
     assert shape["range_m"] == pytest.approx(12.0, abs=0.05)
     assert shape["height_m"] == pytest.approx(1.7, abs=12 * STEP[1])
@@ -171,33 +178,35 @@ def test_features_of_a_board_are_its_measures():
 
 
 @given(seeds)
-def test_features_and_confidence_are_each_clusters_own(seed):
+def test_features_do_not_depend_on_other_clusters(seed):
     rng = np.random.default_rng(seed)
-    far = rng.uniform(5, 40, 4)
-    clusters = [board(f, rng.uniform(0.3, 2), rng.uniform(0.5, 2.5)) for f in far]
-    boxes = [box_of(f) for f in far]
+    distances = rng.uniform(5, 40, 4)
+    clusters = [board(d, rng.uniform(0.3, 2), rng.uniform(0.5, 2.5)) for d in distances]
+    boxes = [make_box(d) for d in distances]
     together = features_of(clusters, boxes)
     order = rng.permutation(4)
     again = features_of([clusters[i] for i in order], [boxes[i] for i in order])
     for name, values in together.items():
         np.testing.assert_array_equal(again[name], values[order])
     for extra in ((), (rng.random(4), rng.normal(0, 0.3, 4))):
-        likely = confidence(together, *extra)
+        likely = compute_confidence(together, *extra)
         assert likely.shape == (4,) and ((likely > 0) & (likely < 1)).all()
 
 
-def test_no_clusters_have_no_features():
-    none = shape_features(np.zeros((0, 3), np.float32), np.array([0]), np.zeros((0, 7)), BEST)
-    assert all(v.shape == (0,) for v in none.values()) and confidence(none).shape == (0,)
+def test_no_clusters_give_empty_features():
+    none = compute_shape_features(np.zeros((0, 3), np.float32), np.array([0]), np.zeros((0, 7)),
+                                  BEST)
+    assert all(v.shape == (0,) for v in none.values()) and compute_confidence(none).shape == (0,)
 
 
 def test_a_single_point_has_finite_features():
-    shape = features_of([np.float32([[9, 0, -1]])], [box_of(9.0)])
-    assert all(np.isfinite(v).all() for v in shape.values()) and np.isfinite(confidence(shape))[0]
+    shape = features_of([np.float32([[9, 0, -1]])], [make_box(9.0)])
+    assert all(np.isfinite(v).all()
+               for v in shape.values()) and np.isfinite(compute_confidence(shape))[0]
 
 
-def test_the_models_have_every_curve_and_likeness_makes_surer():
-    models = _models()
+def test_models_have_every_curve_and_rise_with_similarity():
+    models = _load_models()
     assert set(models["shape"]["curves"]) == set(SHAPE_KNOTS)
     assert set(models["seed"]["curves"]) == set(SHAPE_KNOTS) | set(SEED_KNOTS)
     for model in (models["shape"], models["seed"]):
@@ -209,34 +218,34 @@ def test_the_models_have_every_curve_and_likeness_makes_surer():
 
 
 def two_people():
-    """Points of a person and of a like one beside, where each begins, and their boxes."""
+    """Return points of two similar people, the first row of each, and their boxes."""
     xyz = np.concatenate([board(9.0), board(9.0, offset=0.7) + np.float32([0, 3, 0])])
     first = len(board(9.0))
-    return xyz, np.array([0, first, len(xyz)]), np.concatenate([box_of(9.0), box_of(9.0)])
+    return xyz, np.array([0, first, len(xyz)]), np.concatenate([make_box(9.0), make_box(9.0)])
 
 
-def test_a_seeds_own_cluster_is_known_by_its_points_whatever_is_with_them():
+def test_seed_cluster_is_found_by_the_seeds_points():
     xyz, start, boxes = two_people()
     seed = seed_from_points(xyz[:start[1]], boxes[0])
-    assert own_cluster(seed, xyz, start).tolist() == [True, False]
+    assert find_seed_cluster(seed, xyz, start).tolist() == [True, False]
     most = seed_from_points(xyz[:int(0.6 * start[1])], boxes[0])
-    assert own_cluster(most, xyz, start).tolist() == [True, False]
+    assert find_seed_cluster(most, xyz, start).tolist() == [True, False]
     elsewhere = seed_from_points(xyz[:start[1]] + np.float32(1e-3), boxes[0])
-    assert not own_cluster(elsewhere, xyz, start).any()
-    assert own_cluster(seed, np.zeros((0, 3), np.float32), np.array([0])).shape == (0,)
+    assert not find_seed_cluster(elsewhere, xyz, start).any()
+    assert find_seed_cluster(seed, np.zeros((0, 3), np.float32), np.array([0])).shape == (0,)
 
 
 @pytest.mark.parametrize("certain", [True, False])
-def test_a_certain_seed_is_a_pedestrian_and_another_is_judged_by_its_shape(certain):
+def test_seed_confidence_is_1_if_certain_else_by_shape(certain):
     xyz, start, boxes = two_people()
     boxes[1, 1] += 3.0
     ids = np.repeat(np.int32([1, 2]), np.diff(start))
     params = with_values(BEST, {"confidence.threshold": 0.0})
     seed = seed_from_points(xyz[:start[1]], boxes[0], certain)
-    scores = refine(xyz, ids, boxes, seed, params).final.scores
-    shape = confidence(shape_features(xyz, start, boxes, BEST))
+    scores = refine_clusters(xyz, ids, boxes, seed, params).final.scores
+    shape = compute_confidence(compute_shape_features(xyz, start, boxes, BEST))
     assert scores[0] == pytest.approx(1.0 if certain else shape[0], abs=1e-6)
-    assert scores[1] == pytest.approx(refine(
+    assert scores[1] == pytest.approx(refine_clusters(
         xyz, ids, boxes, seed_from_points(xyz[:start[1]] + np.float32([0, 0.5, 0]), boxes[0]),
         params).final.scores[1], abs=0.05)
 
@@ -251,41 +260,42 @@ def test_stages_of_best_are_accepted_by_confidence():
     flat = np.column_stack([rng.uniform(2, 30, 6000), rng.uniform(-20, 20, 6000),
                             np.full(6000, FLOOR)]).astype(np.float32)
     params = with_values(BEST, {"view.enabled": False, "confidence.threshold": 0.0})
-    s = segment(LidarFrame(np.concatenate([xyz, flat])), params=params)
+    s = segment_cloud(LidarFrame(np.concatenate([xyz, flat])), params=params)
     seed = seed_from_points(people[0] + np.float32([0, -6, 0]),
-                            box_of(8.0)[0] + np.float32([0, -6, 0, 0, 0, 0, 0]))
-    all_ = refined(s, lambda _: seed, params).final
+                            make_box(8.0)[0] + np.float32([0, -6, 0, 0, 0, 0, 0]))
+    all_ = refine_segmented(s, lambda _: seed, params).final
     assert len(all_) >= 3
     limit = float(np.sort(all_.scores)[-2:].mean())
-    some = refined(s, lambda _: seed, with_values(params, {"confidence.threshold": limit})).final
+    some = refine_segmented(s, lambda _: seed,
+                            with_values(params, {"confidence.threshold": limit})).final
     assert 0 < len(some) < len(all_)
     assert sorted(some.scores) == sorted(all_.scores[all_.scores >= np.float32(limit)])
 
 
-def test_an_automatic_seed_is_the_likeliest_cluster_or_the_template():
+def test_automatic_seed_is_the_likeliest_cluster_or_template():
     template = load_seed()
     params = with_values(BEST, {"view.enabled": False})
-    empty = segment(LidarFrame(np.zeros((0, 3), np.float32)), params=params)
-    assert automatic_seed(template, params)(empty) is template
-    one = segment(LidarFrame(np.concatenate([
+    empty = segment_cloud(LidarFrame(np.zeros((0, 3), np.float32)), params=params)
+    assert make_automatic_source(template, params)(empty) is template
+    one = segment_cloud(LidarFrame(np.concatenate([
         board(9.0, 0.55), np.float32([[x, y, FLOOR] for x in np.arange(3, 20, 0.4)
                                       for y in np.arange(-8, 8, 0.4)])])), params=params)
-    assert automatic_seed(template, with_values(params, {"seed.min_confidence": 1.0}))(one) \
+    assert make_automatic_source(template, with_values(params, {"seed.min_confidence": 1.0}))(one) \
         is template
-    own = automatic_seed(template, with_values(params, {"seed.min_confidence": 0.0}))(one)
+    own = make_automatic_source(template, with_values(params, {"seed.min_confidence": 0.0}))(one)
     assert own is not template and np.hypot(*own.xyz[:, :2].mean(axis=0)) == pytest.approx(9, abs=1)
 
 
 @needs_data
-def test_best_finds_more_of_the_real_pedestrians_than_paper():
+def test_best_finds_more_real_pedestrians_than_paper():
     hits = dict.fromkeys(("paper", "best"), 0)
     for frame in open_recording(DATA / "kitti_object"):
         truth = frame.truth().of_class(PEDESTRIAN)
         if len(truth) == 0:
             continue
         for name, params in (("paper", PAPER), ("best", BEST)):
-            s = segment(frame.load(), frame.calibration().camera(), params)
-            found = refined(s, truth_seed(truth), params).final.boxes
+            s = segment_cloud(frame.load(), frame.calibration().camera(), params)
+            found = refine_segmented(s, make_truth_source(truth), params).final.boxes
             near = np.linalg.norm(found[:, None, :3] - truth[None, :, :3], axis=2) <= 1.0
             hits[name] += int(near.any(axis=0).sum())
     assert hits["best"] > hits["paper"] > 0

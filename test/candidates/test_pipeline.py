@@ -1,4 +1,4 @@
-"""Laws of the whole candidate pipeline."""
+"""The whole candidate pipeline."""
 
 from __future__ import annotations
 
@@ -8,30 +8,31 @@ from candidate_samples import boxes_at, floor, person, scene
 
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import STEPS, PipelineParams
-from lidar_perception.candidates.pipeline import find_candidates, segment
+from lidar_perception.candidates.pipeline import find_candidates, segment_cloud
 from lidar_perception.candidates.seed_sources import (
-    automatic_seed,
-    clicked_seed,
-    fixed_seed,
-    truth_seed,
+    make_automatic_source,
+    make_click_source,
+    make_fixed_source,
+    make_truth_source,
 )
 from lidar_perception.candidates.seeds import seed_from_points
-from lidar_perception.candidates.segmented import Segmented
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.params import ViewParams
 
 
 def template():
-    return fixed_seed(seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0]))
+    return make_fixed_source(seed_from_points(person(7, 2).astype(np.float32),
+                                              boxes_at([[7, 2]])[0]))
 
 
 @pytest.mark.parametrize("xyz", [np.zeros((0, 3)), np.float32([[5, 0, -1]]),
                                  np.float32([[5, 0, -1.7]]), floor()],
                          ids=["empty", "one point", "one low point", "only ground"])
-def test_frames_without_objects_give_empty_results_of_the_right_shape(xyz):
+def test_clouds_without_objects_give_empty_results(xyz):
     s, found = find_candidates(LidarFrame(xyz.astype(np.float32)), template())
-    assert isinstance(s, Segmented)
+    assert isinstance(s, SegmentedCloud)
     assert s.indices.tolist() == list(range(len(xyz))) and s.xyz.shape == (len(xyz), 3)
     assert s.ground.shape == (len(xyz),) and s.ground.dtype == bool
     assert s.cluster_ids.shape == (len(xyz),) and s.cluster_ids.dtype == np.int32
@@ -42,41 +43,42 @@ def test_frames_without_objects_give_empty_results_of_the_right_shape(xyz):
     assert tuple(found.ms) == STEPS
 
 
-def test_without_a_seed_the_frame_is_an_input_error():
+def test_a_cloud_without_a_seed_is_an_input_error():
     with pytest.raises(InputError, match="no Pedestrian"):
-        find_candidates(LidarFrame(scene()), truth_seed(np.zeros((0, 7))))
+        find_candidates(LidarFrame(scene()), make_truth_source(np.zeros((0, 7))))
     with pytest.raises(InputError, match="no clusters"):
-        find_candidates(LidarFrame(floor().astype(np.float32)), clicked_seed(np.zeros(3)))
+        find_candidates(LidarFrame(floor().astype(np.float32)), make_click_source(np.zeros(3)))
 
 
-CROP = PipelineParams(view=ViewParams(enabled=True))
+WITH_VIEW = PipelineParams(view=ViewParams(enabled=True))
 
 
-def test_the_crop_without_a_camera_is_an_input_error_that_names_the_remedy():
+def test_error_of_a_view_without_a_camera_names_the_remedy():
     with pytest.raises(InputError, match=r"view\.enabled"):
-        find_candidates(LidarFrame(scene()), template(), params=CROP)
+        find_candidates(LidarFrame(scene()), template(), params=WITH_VIEW)
 
 
-def test_the_crop_is_the_pipeline_on_the_points_in_view():
-    # A camera at the sensor that looks along x: its x is -y, its y is -z, its z is x.
+def test_the_view_equals_the_pipeline_on_the_points_in_view():
+    # A camera at the sensor, looking along x: its x is -y, its y is -z, its z is x.
     axes = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     intrinsics = np.array([[600, 0, 500], [0, 600, 300], [0, 0, 1]])
     camera = Camera(np.column_stack([intrinsics @ axes, np.zeros(3)]), 1000, 600)
     xyz = scene()
     inside = camera.in_view(xyz)
     assert 0 < inside.sum() < len(xyz)
-    cropped, found = find_candidates(LidarFrame(xyz), template(), camera, CROP)
+    cropped, found = find_candidates(LidarFrame(xyz), template(), camera, WITH_VIEW)
     np.testing.assert_array_equal(cropped.indices, np.flatnonzero(inside))
     alone, expected = find_candidates(LidarFrame(xyz[inside]), template())
     np.testing.assert_array_equal(cropped.xyz, alone.xyz)
     np.testing.assert_array_equal(cropped.cluster_ids, alone.cluster_ids)
     np.testing.assert_array_equal(found.final.boxes, expected.final.boxes)
-    empty, _ = find_candidates(LidarFrame(np.zeros((0, 3), np.float32)), template(), camera, CROP)
+    empty, _ = find_candidates(LidarFrame(np.zeros((0, 3), np.float32)), template(), camera,
+                               WITH_VIEW)
     assert empty.xyz.shape == (0, 3)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_result_does_not_depend_on_the_order_of_the_points(seed):
+def test_the_order_of_the_points_does_not_matter(seed):
     xyz = scene()
     order = np.random.default_rng(seed).permutation(len(xyz))
     s, found = find_candidates(LidarFrame(xyz), template())
@@ -91,18 +93,18 @@ def test_the_result_does_not_depend_on_the_order_of_the_points(seed):
         np.testing.assert_allclose(a.scores[i], b.scores[j], rtol=0, atol=1e-5)
 
 
-def test_ground_points_belong_to_no_cluster_and_ids_count_the_boxes():
-    s = segment(LidarFrame(scene()))
+def test_ground_points_have_no_cluster_and_ids_match_boxes():
+    s = segment_cloud(LidarFrame(scene()))
     assert not (s.ground & (s.cluster_ids > 0)).any()
     assert np.unique(s.cluster_ids).tolist() == list(range(len(s.boxes) + 1))
 
 
 @pytest.mark.parametrize("xyz", [np.zeros((0, 3)), floor(), person(6, 0, count=9)],
                          ids=["empty", "only ground", "nine points"])
-@pytest.mark.parametrize("least", [0.0, 0.5])
-def test_the_automatic_seed_is_the_template_where_no_cluster_can_be_one(xyz, least):
-    params = with_values(PipelineParams(), {"seed.min_confidence": least,
+@pytest.mark.parametrize("min_confidence", [0.0, 0.5])
+def test_the_automatic_seed_falls_back_to_the_template(xyz, min_confidence):
+    params = with_values(PipelineParams(), {"seed.min_confidence": min_confidence,
                                             "clustering.dbscan.min_samples": 3})
     given = seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0])
-    assert automatic_seed(given, params)(segment(LidarFrame(xyz.astype(np.float32)),
-                                                 params=params)) is given
+    assert make_automatic_source(given, params)(segment_cloud(LidarFrame(xyz.astype(np.float32)),
+                                                              params=params)) is given

@@ -1,4 +1,4 @@
-"""Laws of seeds: from truth, from a click, from a file."""
+"""Seeds from labels, from a click and from a template file."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from lidar_perception.types import InputError
 seeds = st.integers(0, 2**32 - 1)
 
 
-def test_seed_from_truth_is_the_nearest_pedestrians_points_that_are_not_ground():
+def test_seed_from_truth_has_the_nearest_pedestrians_points():
     xyz = scene()
-    ground = xyz[:, 2] < GROUND_Z + 0.4  # takes the feet too
+    ground = xyz[:, 2] < GROUND_Z + 0.4  # includes the feet
     boxes = boxes_at(PEOPLE[[2, 0, 1]])
     inside = points_in_box(xyz, boxes[1])
     assert (inside & ground).any()
@@ -59,7 +59,7 @@ def clicked_scene():
     return xyz, labels, fit_boxes(xyz, labels, "axis_aligned")
 
 
-def test_seed_from_click_is_the_nearest_clusters():
+def test_seed_from_click_takes_the_nearest_cluster():
     xyz, labels, boxes = clicked_scene()
     for k, click in ((1, [6, 0.2, -1]), (2, [8.5, 3, 0]), (1, [6, 1.2, -1]), (2, [8, 1.8, -1])):
         seed = seed_from_click(np.array(click), xyz, labels, boxes, 2.0)
@@ -68,7 +68,7 @@ def test_seed_from_click_is_the_nearest_clusters():
         assert seed.floor == pytest.approx(boxes[k - 1, 2] - boxes[k - 1, 5] / 2)
 
 
-def test_seed_from_click_takes_no_noise_point_however_near():
+def test_seed_from_click_ignores_noise_points():
     xyz, labels, boxes = clicked_scene()
     xyz = np.concatenate([np.float32([[7, 1.5, -1]]), xyz])
     labels = np.concatenate([np.int32([0]), labels])
@@ -88,16 +88,16 @@ def test_seed_from_click_needs_a_cluster_within_the_radius():
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
-def test_a_click_is_finite_and_near(axis, value):
+def test_a_click_that_is_not_finite_or_far_is_refused(axis, value):
     xyz, labels, boxes = clicked_scene()
     click = np.array([6, 0.2, -1.0])
     click[axis] = value
-    with pytest.raises(InputError, match=r"no finite number|nearest cluster is inf"):
+    with pytest.raises(InputError, match=r"not finite|nearest cluster is inf"):
         seed_from_click(click, xyz, labels, boxes, 2.0)
 
 
 @given(seeds, st.integers(1, 30_000), st.integers(10, 300))
-def test_load_seed_is_the_inverse_of_save_seed(tmp_path_factory, seed, tenth_mm, count):
+def test_load_seed_inverts_save_seed(tmp_path_factory, seed, tenth_mm, count):
     rng = np.random.default_rng(seed)
     xyz = np.float32(np.round(rng.uniform(-90, 90, (count, 3)), 4))
     path = tmp_path_factory.mktemp("seed") / "folder/template.json"
@@ -111,25 +111,27 @@ POINTS = [[5.0, 0.1 * i, -1.0] for i in range(10)]
 GOOD = {"height_m": 1.7, "floor_m": -1.7, "points_m": POINTS}
 
 
-def changed(**values):
+def make_template(**values):
     return json.dumps({**GOOD, **values})
 
 
 @pytest.mark.parametrize("text", [
     "", "not JSON", "[]", "{}", "null", "3", '"text"', json.dumps({"height_m": 1.7}),
-    json.dumps({"points_m": POINTS}), changed(height_m="tall"), changed(height_m=None),
-    changed(height_m=0), changed(height_m=-1.7), changed(height_m=float("nan")),
-    changed(floor_m=None), changed(floor_m=float("inf")), changed(points_m=None),
-    changed(points_m=7), changed(points_m=[]), changed(points_m=POINTS[:9]),
-    changed(points_m=[[1.0, 2.0]] * 10), changed(points_m=[*POINTS, [1.0]]),
-    changed(points_m=[*POINTS, [1.0, 2.0, "x"]]), changed(points_m=[*POINTS, [1, 2, float("nan")]]),
-    changed(points_m=[*POINTS, [10**400, 0, 0]]), changed(height_m=10**400),
-    changed(floor_m=10**400), changed(points_m=[*POINTS, [1e300, 0, 0]]),
-    changed(points_m=[*POINTS, [1e30, 0, 0]]), changed(height_m=1e30), changed(floor_m=-1e30),
-    changed(height_m="9" * 5000), "9" * 5000,
+    json.dumps({"points_m": POINTS}), make_template(height_m="tall"), make_template(height_m=None),
+    make_template(height_m=0), make_template(height_m=-1.7), make_template(height_m=float("nan")),
+    make_template(floor_m=None), make_template(floor_m=float("inf")), make_template(points_m=None),
+    make_template(points_m=7), make_template(points_m=[]), make_template(points_m=POINTS[:9]),
+    make_template(points_m=[[1.0, 2.0]] * 10), make_template(points_m=[*POINTS, [1.0]]),
+    make_template(points_m=[*POINTS, [1.0, 2.0, "x"]]),
+                                  make_template(points_m=[*POINTS, [1, 2, float("nan")]]),
+    make_template(points_m=[*POINTS, [10**400, 0, 0]]), make_template(height_m=10**400),
+    make_template(floor_m=10**400), make_template(points_m=[*POINTS, [1e300, 0, 0]]),
+    make_template(points_m=[*POINTS, [1e30, 0, 0]]), make_template(height_m=1e30),
+                                  make_template(floor_m=-1e30),
+    make_template(height_m="9" * 5000), "9" * 5000,
     "[" * 100_000, '{"points_m": ' + "[" * 100_000, " " * 10_000_001,
 ], ids=lambda text: text[-30:])
-def test_a_bad_template_is_an_input_error_that_names_the_file(tmp_path, text):
+def test_error_of_a_bad_template_names_the_file(tmp_path, text):
     path = tmp_path / "bad.json"
     path.write_text(text)
     with pytest.raises(InputError, match=r"bad\.json") as error:
@@ -137,13 +139,13 @@ def test_a_bad_template_is_an_input_error_that_names_the_file(tmp_path, text):
     assert "\n" not in str(error.value) and len(str(error.value)) < 1000
 
 
-def test_a_pipe_is_no_template_and_is_not_waited_for(tmp_path):
+def test_a_pipe_as_template_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe.json")
     with pytest.raises(InputError, match=r"pipe\.json is no file"):
         load_seed(tmp_path / "pipe.json")
 
 
-def test_a_template_that_cannot_be_read_is_an_input_error_that_names_it(tmp_path):
+def test_error_of_an_unreadable_template_names_the_file(tmp_path):
     binary = tmp_path / "binary.json"
     binary.write_bytes(b"\xff\xfe\x00\x81")
     for path in (tmp_path / "missing.json", tmp_path, binary):
@@ -151,7 +153,7 @@ def test_a_template_that_cannot_be_read_is_an_input_error_that_names_it(tmp_path
             load_seed(path)
 
 
-def test_the_default_template_is_a_pedestrian():
+def test_the_packaged_template_is_a_pedestrian():
     seed = load_seed()
     assert 1.4 < seed.height < 2.1
     pixels = to_pixels(seed.silhouette())

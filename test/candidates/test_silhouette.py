@@ -1,4 +1,4 @@
-"""Laws of silhouettes (STM and CPA), against a plain reading of the paper with OpenCV."""
+"""Silhouettes (STM and CPA), compared with a plain implementation that uses OpenCV."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from samples import DATA, needs_data
 
 from lidar_perception.candidates.params import CpaParams
-from lidar_perception.candidates.pipeline import segment
+from lidar_perception.candidates.pipeline import segment_cloud
 from lidar_perception.candidates.silhouette import (
     COLUMNS,
     ROWS,
-    cpa_scales,
+    compute_cpa_scales,
+    compute_similarity,
+    draw_silhouettes,
     from_pixels,
-    silhouettes,
-    similarity,
     to_pixels,
 )
 from lidar_perception.types import LidarFrame
@@ -27,16 +27,16 @@ PLAIN = np.ones((1, 1))
 
 
 def silhouette(xyz, scales=(1.0,)):
-    return silhouettes(xyz, np.array([0, len(xyz)]), np.array([scales]))[0]
+    return draw_silhouettes(xyz, np.array([0, len(xyz)]), np.array([scales]))[0]
 
 
-def reading(xyz, scales=(1.0,)):
-    """(80, 32) bool, step by step as Sections 3.6 and 3.7 have it."""
+def draw_plainly(xyz, scales=(1.0,)):
+    """Return (80, 32) bool, drawn step by step as in Sections 3.6 and 3.7."""
     points = np.asarray(xyz, np.float64)
     centre = points.mean(axis=0)
     _, vectors = np.linalg.eigh(np.cov((points - centre)[:, :2].T, bias=True))
     lateral = vectors[:, -1]
-    left = np.array([-centre[1], centre[0]])  # of the sensor, when it looks at the cluster
+    left = np.array([-centre[1], centre[0]])  # as seen from the sensor
     lateral = lateral if lateral @ left >= 0 else -lateral
     cluster = np.column_stack([(points - centre)[:, :2] @ lateral, points[:, 2] - centre[2]])
     augmented = np.concatenate([a * cluster for a in scales])  # contracted to the centroid
@@ -50,61 +50,61 @@ def reading(xyz, scales=(1.0,)):
     return cv2.dilate(cv2.morphologyEx(image, cv2.MORPH_CLOSE, kernel), kernel).astype(bool)
 
 
-def cluster(rng, count=None):
-    """A random cluster that is wider one way than the other, some metres from the sensor."""
+def make_cluster(rng, count=None):
+    """Return a random elongated cluster 3 to 40 m from the sensor."""
     count = count or rng.integers(5, 400)
     shape = rng.normal(size=(count, 3)) * [0.1, 0.3, 0.6] * rng.uniform(0.5, 2)
     bearing = rng.uniform(-np.pi, np.pi)
-    return turned(shape + [rng.uniform(3, 40), 0, rng.uniform(-2, 1)], bearing, rng)
+    return rotate(shape + [rng.uniform(3, 40), 0, rng.uniform(-2, 1)], bearing, rng)
 
 
-def turned(xyz, angle, rng=None):
-    """Points turned about z through the sensor; first also about their own centre, with rng."""
+def rotate(xyz, angle, rng=None):
+    """Rotate points about the sensor's z axis; with rng, first about their own centre."""
     if rng is not None:
         centre = xyz.mean(axis=0) * [1, 1, 0]
-        xyz = turned(xyz - centre, rng.uniform(-np.pi, np.pi)) + centre
+        xyz = rotate(xyz - centre, rng.uniform(-np.pi, np.pi)) + centre
     cos, sin = np.cos(angle), np.sin(angle)
     return (xyz @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])).astype(np.float32)
 
 
-def radial(xyz):
-    """How nearly the cluster's widest direction points at the sensor, where left is undecided."""
+def radial_alignment(xyz):
+    """Return |cos| of the angle from the widest direction to the ray; at 1, left is undefined."""
     centre = xyz.mean(axis=0)[:2].astype(float)
     widest = np.linalg.eigh(np.cov(xyz[:, :2].T.astype(float)))[1][:, -1]
     return abs(widest @ centre) / np.linalg.norm(centre)
 
 
 @given(seeds)
-def test_silhouettes_are_the_plain_reading_on_random_clusters(seed):
+def test_silhouettes_of_random_clusters_equal_the_plain_ones(seed):
     rng = np.random.default_rng(seed)
-    clusters = [cluster(rng) for _ in range(4)]
+    clusters = [make_cluster(rng) for _ in range(4)]
     scales = np.column_stack([np.ones(4), rng.uniform(0, 1, (4, 3))])
     scales[rng.random((4, 4)) < 0.3] = 1.0
     start = np.cumsum([0] + [len(c) for c in clusters])
-    images = silhouettes(np.concatenate(clusters), start, scales)
+    images = draw_silhouettes(np.concatenate(clusters), start, scales)
     assert images.shape == (4, ROWS) and images.dtype == np.uint32
     for image, points, factors in zip(images, clusters, scales):
-        np.testing.assert_array_equal(to_pixels(image), reading(points, factors))
+        np.testing.assert_array_equal(to_pixels(image), draw_plainly(points, factors))
 
 
 @needs_data
-def test_silhouettes_are_the_plain_reading_on_real_clusters():
+def test_silhouettes_of_real_clusters_equal_the_plain_ones():
     raw = np.fromfile(sorted(SCANS.glob("*.bin"))[4], np.float32).reshape(-1, 4)
-    found = segment(LidarFrame(np.ascontiguousarray(raw[:, :3])))
+    found = segment_cloud(LidarFrame(np.ascontiguousarray(raw[:, :3])))
     ids = range(1, found.cluster_ids.max() + 1)
     assert len(ids) > 20
     for points in (found.xyz[found.cluster_ids == k] for k in ids):
         for scales in ((1.0,), (1.0, 0.9, 0.8)):
             np.testing.assert_array_equal(to_pixels(silhouette(points, scales)),
-                                          reading(points, scales))
+                                          draw_plainly(points, scales))
 
 
-def test_the_window_is_stretched_over_the_cluster_and_its_top_is_row_0():
-    # An L seen from the sensor: upright on the left, foot to the right.
+def test_the_window_fits_the_cluster_and_row_0_is_its_top():
+    # An L as seen from the sensor: upright on the left, foot to the right.
     upright = np.column_stack([np.full(60, 9.0), np.full(60, 0.5), np.linspace(0, 1.8, 60)])
     foot = np.column_stack([np.full(60, 9.0), np.linspace(-0.5, 0.5, 60), np.zeros(60)])
     pixels = to_pixels(silhouette(np.concatenate([upright, foot]).astype(np.float32)))
-    left = 31  # left of the sensor is the far end of y
+    left = 31  # left of the sensor is the highest y
     assert pixels[:, left].all() and pixels[-1].all()
     assert not pixels[:70, :28].any()
 
@@ -121,132 +121,132 @@ def test_to_pixels_and_from_pixels_are_inverse(seed):
 
 @given(seeds)
 @example(40877)  # one of its images is blank
-def test_similarity_is_the_cosine_of_the_flattened_images(seed):
+def test_similarity_is_the_cosine_of_flattened_images(seed):
     rng = np.random.default_rng(seed)
     pixels = rng.random((5, ROWS, COLUMNS)) < rng.random((5, 1, 1))
     images = np.stack([from_pixels(p) for p in pixels])
     flat = pixels.reshape(5, -1).astype(float)
     norm = np.linalg.norm(flat, axis=1) * np.linalg.norm(flat[0])
-    expected = flat @ flat[0] / np.where(norm > 0, norm, 1.0)  # a blank image is similar to none
-    np.testing.assert_allclose(similarity(images, images[0]), expected, rtol=0, atol=1e-12)
+    expected = flat @ flat[0] / np.where(norm > 0, norm, 1.0)  # 0 for a blank image
+    np.testing.assert_allclose(compute_similarity(images, images[0]), expected, rtol=0, atol=1e-12)
 
 
 @given(seeds)
-def test_similarity_with_itself_is_exactly_1_and_it_is_symmetric_within_0_and_1(seed):
+def test_similarity_is_symmetric_and_exactly_1_with_itself(seed):
     rng = np.random.default_rng(seed)
-    images = np.stack([silhouette(cluster(rng)) for _ in range(3)])
-    table = np.stack([similarity(images, image) for image in images])
-    assert (np.diag(table) == 1.0).all()  # so a threshold of 1 still accepts the seed itself
+    images = np.stack([silhouette(make_cluster(rng)) for _ in range(3)])
+    table = np.stack([compute_similarity(images, image) for image in images])
+    assert (np.diag(table) == 1.0).all()  # so that a threshold of 1 still accepts the seed itself
     np.testing.assert_array_equal(table, table.T)
     assert (table >= 0).all() and (table <= 1).all()
 
 
 def test_similarity_with_a_blank_image_is_0():
     blank, full = np.zeros(ROWS, np.uint32), np.full(ROWS, 2**32 - 1, np.uint32)
-    assert similarity(np.stack([blank, full]), blank).tolist() == [0, 0]
-    assert similarity(np.stack([blank, full]), full).tolist() == [0, 1]
-    assert similarity(np.zeros((0, ROWS), np.uint32), full).shape == (0,)
+    assert compute_similarity(np.stack([blank, full]), blank).tolist() == [0, 0]
+    assert compute_similarity(np.stack([blank, full]), full).tolist() == [0, 1]
+    assert compute_similarity(np.zeros((0, ROWS), np.uint32), full).shape == (0,)
 
 
 @given(seeds, st.floats(-np.pi, np.pi))
-def test_turning_a_cluster_about_the_sensor_keeps_its_silhouette(seed, angle):
-    xyz = cluster(np.random.default_rng(seed), 300)
-    if radial(xyz) < 0.999:
-        moved = silhouette(turned(xyz, angle))
-        assert similarity(moved[None], silhouette(xyz))[0] > 0.97
+def test_rotating_about_the_sensor_keeps_the_silhouette(seed, angle):
+    xyz = make_cluster(np.random.default_rng(seed), 300)
+    if radial_alignment(xyz) < 0.999:
+        moved = silhouette(rotate(xyz, angle))
+        assert compute_similarity(moved[None], silhouette(xyz))[0] > 0.97
 
 
 @given(seeds, st.floats(1.0, 5.0))
-def test_moving_a_cluster_along_its_ray_keeps_its_silhouette(seed, factor):
-    xyz = cluster(np.random.default_rng(seed), 300)
-    if radial(xyz) < 0.999:
-        away = (xyz.mean(axis=0) * (factor - 1)).astype(np.float32) * np.float32([1, 1, 0])
-        moved = silhouette(xyz + away)
-        assert similarity(moved[None], silhouette(xyz))[0] > 0.97
+def test_moving_along_the_ray_keeps_the_silhouette(seed, factor):
+    xyz = make_cluster(np.random.default_rng(seed), 300)
+    if radial_alignment(xyz) < 0.999:
+        offset = (xyz.mean(axis=0) * (factor - 1)).astype(np.float32) * np.float32([1, 1, 0])
+        moved = silhouette(xyz + offset)
+        assert compute_similarity(moved[None], silhouette(xyz))[0] > 0.97
 
 
 @given(seeds)
 def test_a_mirrored_cluster_has_the_mirrored_silhouette(seed):
-    # What is left of the sensor becomes right of it. Pixels are half-open, so not to the bit.
-    xyz = cluster(np.random.default_rng(seed), 300)
-    if radial(xyz) < 0.999:
+    # Left and right are exchanged. Pixels are half-open, so the images are not bit-equal.
+    xyz = make_cluster(np.random.default_rng(seed), 300)
+    if radial_alignment(xyz) < 0.999:
         mirrored = to_pixels(silhouette(xyz * np.float32([1, -1, 1])))
-        assert similarity(from_pixels(mirrored[:, ::-1])[None], silhouette(xyz))[0] > 0.97
+        assert compute_similarity(from_pixels(mirrored[:, ::-1])[None], silhouette(xyz))[0] > 0.97
 
 
 @given(seeds)
-def test_the_order_of_points_does_not_matter_nor_do_the_clusters_beside(seed):
+def test_order_of_points_and_other_clusters_do_not_matter(seed):
     rng = np.random.default_rng(seed)
-    a, b = cluster(rng, 200), cluster(rng, 100)
-    both = silhouettes(np.concatenate([b, a]), np.array([0, 100, 300]), np.ones((2, 1)))
+    a, b = make_cluster(rng, 200), make_cluster(rng, 100)
+    both = draw_silhouettes(np.concatenate([b, a]), np.array([0, 100, 300]), np.ones((2, 1)))
     np.testing.assert_array_equal(both, [silhouette(b), silhouette(a)])
-    assert similarity(silhouette(rng.permutation(a))[None], both[1])[0] > 0.97
+    assert compute_similarity(silhouette(rng.permutation(a))[None], both[1])[0] > 0.97
 
 
 @given(seeds, st.integers(0, 9))
 def test_augmentation_only_adds_pixels(seed, steps):
-    # Closing and dilation are increasing, so what held before them holds after.
-    xyz = cluster(np.random.default_rng(seed))
-    scales = cpa_scales(np.array([20.0]), CpaParams(steps=steps))[0]
+    # Closing and dilation are increasing, so an inclusion before them holds after them.
+    xyz = make_cluster(np.random.default_rng(seed))
+    scales = compute_cpa_scales(np.array([20.0]), CpaParams(steps=steps))[0]
     plain, augmented = to_pixels(silhouette(xyz)), to_pixels(silhouette(xyz, scales))
     assert (augmented >= plain).all()
     if steps == 0:
         np.testing.assert_array_equal(augmented, plain)
 
 
-def test_scales_are_the_papers_inside_15_to_30_metres_and_1_outside():
+def test_scales_are_the_papers_from_15_to_30_metres_else_1():
     ranges = np.array([0, 14.999, 15, 22, 29.999, 30, 31, 1e5])
     inside = [False, False, True, True, True, False, False, False]
-    scales = cpa_scales(ranges, CpaParams())
+    scales = compute_cpa_scales(ranges, CpaParams())
     assert scales.shape == (8, 3) and scales.dtype == np.float64
     np.testing.assert_allclose(scales[inside], [[1.0, 0.9, 0.8]] * 3, rtol=0, atol=1e-12)
     assert (scales[np.logical_not(inside)] == 1).all()
 
 
 def test_scales_fall_by_the_decrement_down_to_min_scale():
-    scales = cpa_scales(np.array([20.0]), CpaParams(steps=11))[0]
+    scales = compute_cpa_scales(np.array([20.0]), CpaParams(steps=11))[0]
     np.testing.assert_allclose(scales, [1, .9, .8, .7, .6, .5, .4, .3, .2, .2, .2, .2], rtol=0,
                                atol=1e-12)
     np.testing.assert_allclose(
-        cpa_scales(np.array([20.0]), CpaParams(steps=3, decrement=0.4, min_scale=0.0))[0],
+        compute_cpa_scales(np.array([20.0]), CpaParams(steps=3, decrement=0.4, min_scale=0.0))[0],
         [1, 0.6, 0.2, 0.0], rtol=0, atol=1e-12)
 
 
-def test_no_steps_and_no_ranges_give_the_right_shapes():
-    np.testing.assert_array_equal(cpa_scales(np.array([5.0, 20.0]), CpaParams(steps=0)),
+def test_no_steps_and_no_clusters_give_the_right_shapes():
+    np.testing.assert_array_equal(compute_cpa_scales(np.array([5.0, 20.0]), CpaParams(steps=0)),
                                   np.ones((2, 1)))
-    assert cpa_scales(np.zeros(0), CpaParams()).shape == (0, 3)
-    none = silhouettes(np.zeros((0, 3), np.float32), np.array([0]), np.ones((0, 3)))
+    assert compute_cpa_scales(np.zeros(0), CpaParams()).shape == (0, 3)
+    none = draw_silhouettes(np.zeros((0, 3), np.float32), np.array([0]), np.ones((0, 3)))
     assert none.shape == (0, ROWS) and none.dtype == np.uint32
 
 
 @pytest.mark.parametrize("at", [[8, 1, -1], [0, 0, 1], [0.3, -70, -1.2], [-7e4, 7e4, 3]])
 @pytest.mark.parametrize("scales", [(1.0,), (1.0, 0.9, 0.8), (1.0, 0.0)])
-def test_points_at_one_place_are_the_top_left_pixel_dilated(at, scales):
-    # There is no extent to stretch over; the first pixel of the window stands for the point.
+def test_coincident_points_set_the_top_left_pixel(at, scales):
+    # Without an extent, the point falls into the first pixel of the window.
     for count in (1, 2, 7, 100):
         pixels = to_pixels(silhouette(np.full((count, 3), at, np.float32), scales))
         assert pixels[:2, :2].all() and pixels.sum() == 4
 
 
-def test_a_vertical_line_fills_the_first_column_dilated():
+def test_a_vertical_line_fills_the_first_column():
     line = np.float32([8, 2, 0]) + np.linspace(-1.5, 0.5, 400, dtype=np.float32)[:, None] * \
         np.float32([0, 0, 1])
     pixels = to_pixels(silhouette(line))
     assert pixels[:, :2].all() and not pixels[:, 2:].any()
-    np.testing.assert_array_equal(pixels, reading(line))
+    np.testing.assert_array_equal(pixels, draw_plainly(line))
 
 
-def test_a_horizontal_line_fills_the_first_row_dilated():
+def test_a_horizontal_line_fills_the_first_row():
     line = np.float32([8, 0, -1]) + np.linspace(-1, 1, 200, dtype=np.float32)[:, None] * \
         np.float32([0, 1, 0])
     pixels = to_pixels(silhouette(line))
     assert pixels[:2].all() and not pixels[2:].any()
 
 
-def test_the_input_stays_unchanged():
-    xyz = cluster(np.random.default_rng(0), 50)
+def test_the_input_is_not_modified():
+    xyz = make_cluster(np.random.default_rng(0), 50)
     before, scales = xyz.copy(), np.array([[1.0, 0.9]])
-    silhouettes(xyz, np.array([0, 50]), scales)
+    draw_silhouettes(xyz, np.array([0, 50]), scales)
     np.testing.assert_array_equal(xyz, before)
     assert scales.tolist() == [[1.0, 0.9]]

@@ -13,8 +13,8 @@ from samples import DATA, crowd_folder
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import StmParams
-from lidar_perception.candidates.pipeline import segment
-from lidar_perception.candidates.refine import STAGES, refine
+from lidar_perception.candidates.pipeline import segment_cloud
+from lidar_perception.candidates.refine import STAGES, refine_clusters
 from lidar_perception.clustering.params import DbscanParams
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
@@ -68,14 +68,14 @@ def refined(kitti):
     found = []
     for frame in open_recording(kitti).frames[:-1]:
         labelled = load_labelled(frame)
-        segmented = segment(labelled.frame, labelled.camera, PAPER)
+        segmented = segment_cloud(labelled.frame, labelled.camera, PAPER)
         seed = nearest_seed(segmented, labelled)
         found.append((labelled, segmented, seed, of(segmented, seed, PAPER)))
     return found
 
 
 def of(segmented, seed, params):
-    return refine(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed, params)
+    return refine_clusters(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed, params)
 
 
 def total(measured, *keys):

@@ -11,7 +11,11 @@ from hypothesis import strategies as st
 from samples import crowd_folder
 
 from lidar_perception.candidates.configurations import PAPER
-from lidar_perception.candidates.silhouette import covered, cpa_scales, silhouettes
+from lidar_perception.candidates.silhouette import (
+    compute_cpa_scales,
+    count_pixels,
+    draw_silhouettes,
+)
 from lidar_perception.data.open import open_recording
 from lidar_perception.param_fields import with_values
 from lidar_perception.reproduction import stm_cpa
@@ -152,9 +156,9 @@ def test_more_copies_fill_a_silhouette_no_less():
     for steps in range(4):
         params = with_values(PAPER, {"cpa.steps": steps, "cpa.min_range": 0.0,
                                      "cpa.max_range": 100.0})
-        image = silhouettes(seed.xyz, np.array([0, len(seed.xyz)]),
-                            cpa_scales(np.array([22.5]), params.cpa))
-        fill.append(int(covered(image)[0]))
+        image = draw_silhouettes(seed.xyz, np.array([0, len(seed.xyz)]),
+                                 compute_cpa_scales(np.array([22.5]), params.cpa))
+        fill.append(int(count_pixels(image)[0]))
     assert fill == sorted(fill)
 
 

@@ -10,7 +10,7 @@ from samples import header, scene
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.pipeline import segment
+from lidar_perception.candidates.pipeline import segment_cloud
 from lidar_perception.param_fields import with_values
 from lidar_perception.robot.crop import cropped, kept_points
 from lidar_perception.robot.params import CropParams
@@ -104,7 +104,7 @@ def test_the_pipeline_sees_what_is_left_of_the_whole_cloud():
     params = with_values(PipelineParams(), {"crop.min_range": 4.0, "crop.sectors": (90.0, 270.0)})
     kept, before = cropped(frame, params.crop)
     assert 0 < len(kept) < len(frame)
-    whole, part = segment(frame, params=params), segment(before)
+    whole, part = segment_cloud(frame, params=params), segment_cloud(before)
     np.testing.assert_array_equal(whole.indices, kept.take(part.indices))
     for name in ("xyz", "ground", "cluster_ids", "boxes"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(part, name))

@@ -10,8 +10,8 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 from test_bad_input import CLOUD, MARKERS
 from test_graph import PAPER
 
-from lidar_perception.candidates.pipeline import find_candidates, segment
-from lidar_perception.candidates.seed_sources import fixed_seed
+from lidar_perception.candidates.pipeline import find_candidates, segment_cloud
+from lidar_perception.candidates.seed_sources import make_fixed_source
 from lidar_perception.candidates.seeds import load_seed
 from lidar_perception.data.open import open_recording
 from lidar_perception.param_fields import with_values
@@ -27,9 +27,9 @@ def test_boxes_and_candidates_have_the_ids_of_the_cloud(processes, peer, drive_b
     in the text of its candidates; clustering replaces them by its own, in the cloud and the boxes
     alike."""
     params = with_values(PAPER, FILE)
-    seed = fixed_seed(load_seed(params.seed.file))
+    seed = make_fixed_source(load_seed(params.seed.file))
     scan = next(iter(open_recording(drive_bag))).load()
-    segmented = segment(scan, None, params)
+    segmented = segment_cloud(scan, None, params)
     assert len(segmented.indices) == len(scan)
     own = segmented.cluster_ids.astype(np.int64)
     foreign = np.where(own > 0, 2**32 - 5 - 7 * own, 0)

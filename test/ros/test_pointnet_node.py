@@ -17,7 +17,7 @@ from pointnet_samples import eager, lively, small
 from test_bad_input import BAD, CLOUD, MARKERS, cloud
 
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.pipeline import segment
+from lidar_perception.candidates.pipeline import segment_cloud
 from lidar_perception.cli.options import read_config
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.checkpoint import Header as PointPillarsHeader
@@ -60,8 +60,8 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
     peer.send(peer.talker(POINTS, CLOUD), message(1), lambda: points and received(found, 1),
               "detections")
     scan = to_frame(message(1), 0.0)[0]
-    segmented = segment(scan, None, with_values(PipelineParams(),
-                                                read_config(SHARED, PipelineParams())))
+    segmented = segment_cloud(scan, None, with_values(PipelineParams(),
+                                                      read_config(SHARED, PipelineParams())))
     assert segmented.ground.any() and segmented.cluster_ids.max() >= 5
     np.testing.assert_array_equal(column(points[-1], "cluster_id", np.arange(len(scan))),
                                   segmented.cluster_ids)

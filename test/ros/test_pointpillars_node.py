@@ -15,7 +15,7 @@ from rcl_interfaces.srv import DescribeParameters
 from test_bad_input import BAD, CLOUD, MARKERS, cloud
 
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.pipeline import segment
+from lidar_perception.candidates.pipeline import segment_cloud
 from lidar_perception.cli.options import read_config
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
@@ -57,7 +57,7 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
 
     params = with_values(PipelineParams(), read_config(EXPERTS, PipelineParams()))
     scan = to_frame(message(1), 0.0)[0]
-    segmented = segment(scan, None, params)
+    segmented = segment_cloud(scan, None, params)
     columns = {"ground": segmented.ground, "cluster_ids": segmented.cluster_ids}
     assert segmented.ground.any() and segmented.cluster_ids.max() >= 2
     marked, indices = points[-1], np.arange(len(scan))

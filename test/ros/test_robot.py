@@ -11,7 +11,7 @@ from test_robot_frames import PERIOD, START, WALKING, message, mounted, transfor
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
-from lidar_perception.candidates.seed_sources import fixed_seed
+from lidar_perception.candidates.seed_sources import make_fixed_source
 from lidar_perception.candidates.seeds import load_seed
 from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.transforms import STATIC_QOS
@@ -45,7 +45,7 @@ def test_a_cropped_cloud_over_dds_is_the_cropped_frame_offline(processes, peer, 
     talker = peer.talker("/in", CLOUD)
     peer.send(talker, cloud, lambda: found and clouds, "both results")
     frame, usable = to_frame(cloud)
-    segmented, candidates = find_candidates(frame, fixed_seed(load_seed("")), params=params)
+    segmented, candidates = find_candidates(frame, make_fixed_source(load_seed("")), params=params)
     expected, received = candidates.final, to_detections(from_marker_array(found[-1]))
     assert len(expected) and 0 < len(segmented.indices) < len(frame)
     np.testing.assert_array_equal(received.boxes, expected.boxes)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import logit
 
 from lidar_perception.candidates.boxes import snap_to_ground
-from lidar_perception.candidates.confidence import confidence, shape_features
+from lidar_perception.candidates.confidence import compute_confidence, compute_shape_features
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.detectors.pointnet.clusters import points_of
@@ -46,7 +46,7 @@ def silhouette_at(boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray,
     asked = near.any(axis=0)
     chosen, near = chosen[asked], near[:, asked]
     own, start = group_points(xyz, cluster_ids, chosen + 1)
-    confidences = confidence(shape_features(own, start, found[chosen], BEST))
+    confidences = compute_confidence(compute_shape_features(own, start, found[chosen], BEST))
     return (near * confidences).max(axis=1, initial=0.0)
 
 

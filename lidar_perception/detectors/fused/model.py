@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import expit
 
-from lidar_perception.candidates.curves import log_odds
+from lidar_perception.candidates.curves import compute_log_odds
 from lidar_perception.detectors.fused.evidence import Evidence
 from lidar_perception.detectors.fused.fusion import Models
 from lidar_perception.types import CLASSES
@@ -23,8 +23,9 @@ def probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence) -> 
     for class_id in np.unique(class_ids):
         own = class_ids == class_id
         if CLASSES[class_id] in models:
-            result[own] = expit(log_odds(models[CLASSES[class_id]],
-                                         {source: odds[own] for source, odds in evidence.items()}))
+            result[own] = expit(compute_log_odds(models[CLASSES[class_id]],
+                                                 {source: odds[own] for source,
+                                                  odds in evidence.items()}))
     return result
 
 

@@ -9,8 +9,14 @@ import numpy as np
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.seeds import Seed
-from lidar_perception.candidates.segmented import Segmented
-from lidar_perception.candidates.silhouette import COLUMNS, ROWS, covered, silhouettes, similarity
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud
+from lidar_perception.candidates.silhouette import (
+    COLUMNS,
+    ROWS,
+    compute_similarity,
+    count_pixels,
+    draw_silhouettes,
+)
 from lidar_perception.param_fields import flatten
 from lidar_perception.reproduction.labelled import Labelled, nearest_seed
 from lidar_perception.reproduction.variants import NOTHING, Found, clusters_as_tall, study
@@ -39,7 +45,7 @@ def by_points(counts: np.ndarray) -> np.ndarray:
     return np.clip(np.ceil(np.log2(FULL_COUNT / np.maximum(counts, 1))), 0, MAX_STEPS)
 
 
-def find(labelled: Labelled, segments: Callable[[PipelineParams], Segmented]
+def find(labelled: Labelled, segments: Callable[[PipelineParams], SegmentedCloud]
          ) -> dict[str, Found]:
     """Candidates by variant."""
     segmented = segments(PAPER)
@@ -58,15 +64,17 @@ def find(labelled: Labelled, segments: Callable[[PipelineParams], Segmented]
         "by fill": _by_fill(points, start, seed),
     }
     template = seed.silhouette(PAPER)
-    return {name: Found(boxes, similarity(silhouettes(points, start, _copies(number)), template),
+    return {name: Found(boxes, compute_similarity(draw_silhouettes(points, start, _copies(number)),
+                                                  template),
                         PAPER.stm.threshold) for name, number in steps.items()}
 
 
 def _by_fill(points: np.ndarray, start: np.ndarray, seed: Seed) -> np.ndarray:
     """(K,) the fewest steps after which a silhouette is as full as the seed's, nearly."""
-    wanted = MIN_FILL * covered(seed.silhouette(PAPER)[None])[0] / (ROWS * COLUMNS)
+    wanted = MIN_FILL * count_pixels(seed.silhouette(PAPER)[None])[0] / (ROWS * COLUMNS)
     clusters = len(start) - 1
-    fill = np.stack([covered(silhouettes(points, start, _copies(np.full(clusters, steps))))
+    fill = np.stack([count_pixels(draw_silhouettes(points, start,
+                                                   _copies(np.full(clusters, steps))))
                      for steps in range(MAX_STEPS + 1)]) / (ROWS * COLUMNS)
     enough = fill >= wanted
     return np.where(enough.any(axis=0), enough.argmax(axis=0), MAX_STEPS)

@@ -10,9 +10,9 @@ import numpy as np
 from sklearn.calibration import calibration_curve
 from sklearn.metrics import precision_recall_curve
 
-from lidar_perception.candidates.confidence import confidence, shape_features
+from lidar_perception.candidates.confidence import compute_confidence, compute_shape_features
 from lidar_perception.candidates.configurations import BEST, PAPER
-from lidar_perception.candidates.pipeline import refined
+from lidar_perception.candidates.pipeline import refine_segmented
 from lidar_perception.data.frame import Frame
 from lidar_perception.groups import group_points
 from lidar_perception.param_fields import flatten, with_values
@@ -50,14 +50,15 @@ def measure(frames: Sequence[Frame], number: int) -> dict[str, Any]:
     scored = {}
     for name, params in SCORES.items():
         try:
-            found = refined(segments(params), lambda s: nearest_seed(s, labelled), params).final
+            found = refine_segmented(segments(params), lambda s: nearest_seed(s, labelled),
+                                     params).final
         except InputError:
             found = Detections.none()
         scored[name] = ranked(found.boxes, found.scores, truth)
     s = segments(BEST)
     everything = np.arange(1, len(s.boxes) + 1)
-    shape = shape_features(*group_points(s.xyz, s.cluster_ids, everything), s.boxes, BEST)
-    scored[SHAPE] = ranked(s.boxes, confidence(shape), truth)
+    shape = compute_shape_features(*group_points(s.xyz, s.cluster_ids, everything), s.boxes, BEST)
+    scored[SHAPE] = ranked(s.boxes, compute_confidence(shape), truth)
     return {"frame": frames[number].name, "pedestrians": len(truth), "scored": scored}
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.segmented import Segmented
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.reproduction.experiment import Experiment, Section
 from lidar_perception.reproduction.labelled import Labelled
@@ -24,7 +24,7 @@ WITHOUT = {f"{name}, nearest truth, it left out": f"{name}, nearest truth"
            for name in ("paper", "best")}
 
 
-def find(labelled: Labelled, segments: Callable[[PipelineParams], Segmented]
+def find(labelled: Labelled, segments: Callable[[PipelineParams], SegmentedCloud]
          ) -> dict[str, Found]:
     """Candidates by variant; once more without the seed pedestrian, which is given and so no
     merit to find."""

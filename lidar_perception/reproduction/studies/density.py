@@ -11,8 +11,12 @@ import numpy as np
 from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.seeds import MIN_POINTS, Seed
-from lidar_perception.candidates.segmented import Segmented
-from lidar_perception.candidates.silhouette import cpa_scales, silhouettes, similarity
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud
+from lidar_perception.candidates.silhouette import (
+    compute_cpa_scales,
+    compute_similarity,
+    draw_silhouettes,
+)
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.reproduction.labelled import Labelled, nearest_seed
 from lidar_perception.reproduction.variants import (
@@ -58,7 +62,7 @@ def thinned(seed: Seed, factor: float, params: PipelineParams = PAPER) -> Seed:
     return Seed(seed.xyz[np.sort(first)], seed.floor, seed.height)
 
 
-def find(labelled: Labelled, segments: Callable[[PipelineParams], Segmented]
+def find(labelled: Labelled, segments: Callable[[PipelineParams], SegmentedCloud]
          ) -> dict[str, Found]:
     """Candidates by variant."""
     found = {}
@@ -73,19 +77,19 @@ def find(labelled: Labelled, segments: Callable[[PipelineParams], Segmented]
         return found | dict.fromkeys((THINNED, KERNEL), NOTHING)
     boxes, points, start = clusters_as_tall(segmented, [seed], PAPER)
     ranges = np.hypot(boxes[:, 0], boxes[:, 1])
-    scales = cpa_scales(ranges, PAPER.cpa)
+    scales = compute_cpa_scales(ranges, PAPER.cpa)
     images = with_copies(boxes, points, start, PAPER)
     own = np.hypot(*seed.xyz[:, :2].mean(axis=0))
     alike = np.zeros((2, len(boxes)))
     for k, r in enumerate(ranges):
         like = thinned(seed, r / own)
         if len(like.xyz) >= MIN_POINTS // 2:
-            alike[0, k] = similarity(images[k:k + 1], like.silhouette(PAPER))[0]
+            alike[0, k] = compute_similarity(images[k:k + 1], like.silhouette(PAPER))[0]
         wide = with_values(PAPER, {"stm.dilations": _kernel(r, seed.height)})
         part = points[start[k]:start[k + 1]]
-        image = silhouettes(part, np.array([0, len(part)]), scales[k:k + 1], params=wide)
+        image = draw_silhouettes(part, np.array([0, len(part)]), scales[k:k + 1], params=wide)
         near = with_values(PAPER, {"stm.dilations": _kernel(own, seed.height)})
-        alike[1, k] = similarity(image, seed.silhouette(near))[0]
+        alike[1, k] = compute_similarity(image, seed.silhouette(near))[0]
     return found | {name: Found(boxes, row, PAPER.stm.threshold)
                     for name, row in zip((THINNED, KERNEL), alike)}
 

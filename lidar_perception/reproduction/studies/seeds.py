@@ -11,8 +11,8 @@ import numpy as np
 from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.seeds import MIN_POINTS, Seed, seed_from_click, seed_from_points
-from lidar_perception.candidates.segmented import Segmented
-from lidar_perception.candidates.silhouette import similarity
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud
+from lidar_perception.candidates.silhouette import compute_similarity
 from lidar_perception.geometry import points_in_box
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.reproduction.labelled import Labelled, nearest_seed
@@ -36,7 +36,7 @@ SEVERAL = 3
 COMBINED: dict[str, Callable[..., np.ndarray]] = {"maximum": np.max, "mean": np.mean}
 
 
-def _one(segmented: Segmented, labelled: Labelled, rng: np.random.Generator
+def _one(segmented: SegmentedCloud, labelled: Labelled, rng: np.random.Generator
          ) -> dict[str, Callable[[PipelineParams], Seed]]:
     """Sources of a single seed."""
     def click(params: PipelineParams) -> Seed:
@@ -68,7 +68,7 @@ def _one(segmented: Segmented, labelled: Labelled, rng: np.random.Generator
     }
 
 
-def _several(segmented: Segmented, labelled: Labelled) -> list[Seed]:
+def _several(segmented: SegmentedCloud, labelled: Labelled) -> list[Seed]:
     """Seeds of the nearest pedestrians that have enough points."""
     order = np.argsort(np.hypot(*labelled.pedestrians[:, :2].T))
     seeds: list[Seed] = []
@@ -79,7 +79,7 @@ def _several(segmented: Segmented, labelled: Labelled) -> list[Seed]:
     return seeds
 
 
-def _found_with_several(segmented: Segmented, seeds: list[Seed], params: PipelineParams,
+def _found_with_several(segmented: SegmentedCloud, seeds: list[Seed], params: PipelineParams,
                         combine: Callable[..., np.ndarray]) -> Found:
     """Candidates by what their similarities to the seeds (T, K) combine to; the height may be that
     of any of them."""
@@ -87,11 +87,12 @@ def _found_with_several(segmented: Segmented, seeds: list[Seed], params: Pipelin
         return NOTHING
     boxes, points, start = clusters_as_tall(segmented, seeds, params)
     images = with_copies(boxes, points, start, params)
-    alike = np.stack([similarity(images, seed.silhouette(params), params.stm) for seed in seeds])
+    alike = np.stack([compute_similarity(images, seed.silhouette(params), params.stm)
+                      for seed in seeds])
     return Found(boxes, combine(alike, axis=0), params.stm.threshold)
 
 
-def _banked(segmented: Segmented, seed: Seed, params: PipelineParams, views: tuple[float, ...]
+def _banked(segmented: SegmentedCloud, seed: Seed, params: PipelineParams, views: tuple[float, ...]
             ) -> Found:
     """Candidates by their likeness to the simulated pedestrian of their own range, seen from one
     of the views; the seed gives the height."""
@@ -103,12 +104,12 @@ def _banked(segmented: Segmented, seed: Seed, params: PipelineParams, views: tup
     alike = np.zeros(len(boxes))
     for i, r in enumerate(ranges):
         for view in views:
-            own = similarity(images, bank[r, view].silhouette(params), params.stm)
+            own = compute_similarity(images, bank[r, view].silhouette(params), params.stm)
             alike = np.maximum(alike, np.where(nearest == i, own, 0.0))
     return Found(boxes, alike, params.stm.threshold)
 
 
-def find(labelled: Labelled, segments: Callable[[PipelineParams], Segmented]
+def find(labelled: Labelled, segments: Callable[[PipelineParams], SegmentedCloud]
          ) -> dict[str, Found]:
     """Candidates by variant."""
     found = {}

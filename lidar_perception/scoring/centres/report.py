@@ -14,9 +14,9 @@ from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.refine import STAGES, Candidates
 from lidar_perception.candidates.seed_sources import (
     SeedSource,
-    automatic_seed,
-    fixed_seed,
-    truth_seed,
+    make_automatic_source,
+    make_fixed_source,
+    make_truth_source,
 )
 from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.candidates.warm_up import warm_up
@@ -87,10 +87,10 @@ def seed_source(truth: np.ndarray, template: Seed | None, params: PipelineParams
     """Where a frame's seed comes from: its true pedestrians (M, 7) without a template, the paper's
     protocol, else what params say."""
     if template is None:
-        return truth_seed(truth)
+        return make_truth_source(truth)
     if params.seed.source == "automatic":
-        return automatic_seed(template, params)
-    return fixed_seed(template)
+        return make_automatic_source(template, params)
+    return make_fixed_source(template)
 
 
 @dataclass

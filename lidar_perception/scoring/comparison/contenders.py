@@ -10,7 +10,11 @@ from typing import Any
 
 from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.seed_sources import SeedSource, automatic_seed, truth_seed
+from lidar_perception.candidates.seed_sources import (
+    SeedSource,
+    make_automatic_source,
+    make_truth_source,
+)
 from lidar_perception.candidates.seeds import load_seed
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame
@@ -172,9 +176,9 @@ def _no_seed(segmented):
 def _labelled(frame: Frame) -> SeedSource | None:
     """The paper's seed: the nearest label; None in frames without a pedestrian."""
     truth = pedestrians_of(frame)
-    return truth_seed(truth) if len(truth) else None
+    return make_truth_source(truth) if len(truth) else None
 
 
 def _own_seed(params: PipelineParams) -> Callable[[Frame], SeedSource]:
-    source = automatic_seed(load_seed(), params)
+    source = make_automatic_source(load_seed(), params)
     return lambda frame: source

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.candidates.segmented import points_in_view
+from lidar_perception.candidates.segmented_cloud import crop_to_view
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.data.frame import Frame, PointTruth, Recording
@@ -71,7 +71,7 @@ def by_methods(params: SegmentationParams, grounds: tuple[str, ...], clusterings
     def on_boxes(frame: Frame, truth: Any) -> SegmentationResult:
         scan, camera = frame.load(), frame.camera()
         if camera is not None:
-            _, scan = points_in_view(scan, camera, params.view)
+            _, scan = crop_to_view(scan, camera, params.view)
         return SegmentationResult({}, clustered(scan, segment_ground(scan, params.ground),
                                                 objects_in_boxes(scan.xyz, truth)),
                                   whole=camera is None and params.view.enabled)

@@ -1,4 +1,4 @@
-"""A frame cut into ground and clusters: what the seed and the candidates are looked for in."""
+"""A cloud segmented into ground and clusters, in which the seed and the candidates are found."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from lidar_perception.wire.params import ViewParams
 
 
 @dataclass(frozen=True)
-class Segmented:
-    """Ground, clusters and boxes of the M points of a frame that are in view.
+class SegmentedCloud:
+    """Ground, clusters and boxes of the M points of a cloud that are in view.
 
-    indices (M,) int64 their rows in the frame, xyz (M, 3) float32, ground (M,) bool, cluster_ids
-    (M,) int32 with 0 = none, boxes (K, 7) float32 of clusters 1..K down to the ground plane;
-    numbers (K,) int64: what the cloud calls these clusters, None for 1..K; ms per step.
+    indices (M,) int64: rows of the points in the cloud.
+    xyz (M, 3) float32, ground (M,) bool, cluster_ids (M,) int32, 0 for no cluster, 1..K.
+    boxes (K, 7) float32: boxes of the clusters, down to the ground plane.
+    numbers (K,) int64: the cloud's own ids of these clusters; None for 1..K.
+    ms: duration of each step.
     """
 
     indices: np.ndarray
@@ -32,19 +34,22 @@ class Segmented:
     ms: dict[str, float] = field(default_factory=dict)
 
 
-def grounded_boxes(xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray,
-                   shape: str) -> np.ndarray:
-    """(K, 7) boxes of clusters 1..K, of a shape of params.BOX_SHAPES, down to the plane through
-    the ground points."""
+def fit_grounded_boxes(xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray,
+                       shape: str) -> np.ndarray:
+    """Fit boxes (K, 7) to clusters 1..K, down to the plane through the ground points.
+
+    shape is one of clustering.params.BOX_SHAPES.
+    """
     return snap_to_ground(fit_boxes(xyz, cluster_ids, shape),
                           fit_plane(xyz.compress(ground, axis=0)))
 
 
 def explain_nothing(usable: int, ground: np.ndarray,
                     cluster_ids: np.ndarray | None = None) -> str | None:
-    """Why a frame can have no candidates, with the remedy; None if nothing is wrong so far.
+    """Explain why a cloud has no candidates, with the remedy; None if there is no reason so far.
 
-    usable is the number of finite points; ground (M,) and cluster_ids (M,) of those in view.
+    usable is the number of finite points; ground (M,) and cluster_ids (M,) are those of the points
+    in view.
     """
     if usable == 0:
         return "the cloud is empty or has no finite point, or crop.* leaves none"
@@ -60,10 +65,17 @@ def explain_nothing(usable: int, ground: np.ndarray,
     return None
 
 
-def points_in_view(frame: LidarFrame, camera: Camera | None,
-                   params: ViewParams) -> tuple[np.ndarray, LidarFrame]:
-    """indices (M,) int64 of the points of the frame in the camera's view, and the frame of these;
-    all of them while the crop is off. InputError if it is on and there is no camera."""
+def crop_to_view(frame: LidarFrame, camera: Camera | None,
+                 params: ViewParams) -> tuple[np.ndarray, LidarFrame]:
+    """Keep the points of a frame that are in the camera's view.
+
+    Returns:
+        indices (M,) int64 of the points kept, and the frame of these points. All points are kept
+        if params.enabled is False.
+
+    Raises:
+        InputError: if it is True and there is no camera.
+    """
     if not params.enabled:
         return np.arange(len(frame)), frame
     if camera is None:
