@@ -17,7 +17,7 @@ from lidar_perception.robot.poses import moved_boxes, moved_points
 from lidar_perception.robot.tree import Missing, TransformTree
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import to_truth
-from lidar_perception.wire.track_markers import drawn_trails
+from lidar_perception.wire.track_markers import read_trails
 from lidar_studio.drive import Scan
 from lidar_studio.results import (
     compared,
@@ -164,7 +164,7 @@ class Live:
     def _add(self, frame: LiveFrame, topic: str, objects: MarkedObjects, message: Any) -> None:
         """In the frame of its cloud, at its stamp; once TF has come, where that is late."""
         heard, own = self.topics[topic], frame.cloud.header.frame_id
-        trails = drawn_trails(message) if message is not None and heard.kind == TRACKS else {}
+        trails = read_trails(message) if message is not None and heard.kind == TRACKS else {}
         if objects.frame_id.lstrip("/") not in ("", own.lstrip("/")):
             try:
                 pose = self.tree.lookup(own, objects.frame_id, frame.stamp_ns)

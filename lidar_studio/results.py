@@ -28,8 +28,8 @@ from lidar_perception.scoring.recorded import by_stamp
 from lidar_perception.types import Detections, GroundTruth, InputError
 from lidar_perception.wire.messages import (
     FullScale,
-    cluster_column,
-    column,
+    read_cluster_ids,
+    read_column,
     to_detections,
     to_frame,
 )
@@ -233,7 +233,7 @@ def scan_in(message: Any, intensity_max: float = 0.0, scale: FullScale = full_sc
     """Return a PointCloud2 with the ground and clusters that it has; none where it has no such
     column. intensity_max, scale: see to_frame. InputError where it is broken."""
     cloud, indices = to_frame(message, intensity_max, scale)
-    ground, clusters = column(message, "ground", indices), cluster_column(message, indices)
+    ground, clusters = read_column(message, "ground", indices), read_cluster_ids(message, indices)
     return scan_of(cloud, np.zeros(len(cloud), bool) if ground is None else ground > 0,
                    np.zeros(len(cloud), np.int32) if clusters is None else clusters[0])
 

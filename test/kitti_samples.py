@@ -20,7 +20,7 @@ from samples import (
 from lidar_perception.data.kitti.labels import format_label, to_labels
 from lidar_perception.types import GroundTruth
 from lidar_perception.wire.codec import bag_message, decode, encode
-from lidar_perception.wire.messages import to_truth, truth_markers
+from lidar_perception.wire.messages import make_truth_markers, to_truth
 from msg_utils.markers import from_marker_array
 
 TRACKING_LABELS = """\
@@ -81,7 +81,7 @@ def text_of(truth: GroundTruth) -> list[str]:
 
 
 def over_the_wire(truth: GroundTruth) -> GroundTruth:
-    raw = encode(truth_markers(truth, header(bag_message), bag_message))
+    raw = encode(make_truth_markers(truth, header(bag_message), bag_message))
     return to_truth(from_marker_array(decode(raw, "visualization_msgs/msg/MarkerArray")))
 
 

@@ -9,7 +9,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.robot.placing import tilted
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import odometry
+from lidar_perception.wire.messages import make_odometry
 from lidar_perception.wire.topics import POINTS, TF, TF_STATIC
 from lidar_perception.wire.transforms import ODOMETRY_MESSAGE, TF_MESSAGE
 from msg_utils.stamps import SECOND, header_message
@@ -52,7 +52,7 @@ def moving(topic, child="base_link", seconds=CLOUDS / 10):
     """Odometry every 20 ms."""
     for i in range(-2, round(50 * seconds) + 1):
         stamp = START + i * SECOND // 50
-        yield topic, ODOMETRY_MESSAGE, stamp, odometry(
+        yield topic, ODOMETRY_MESSAGE, stamp, make_odometry(
             base_at(stamp), header_message(stamp, "odom", bag_message), child, bag_message)
 
 

@@ -13,7 +13,7 @@ from samples import each_make, header
 from lidar_perception.clustering.shapes import fit_boxes, fit_ellipses
 from lidar_perception.groups import cluster_count, group_points, groups_of, renumbered
 from lidar_perception.types import InputError
-from lidar_perception.wire.messages import cluster_column
+from lidar_perception.wire.messages import read_cluster_ids
 from msg_utils.point_cloud2 import from_array
 
 ids = st.lists(st.sampled_from([-2**31, -1, 0, 1, 2, 3, 7, 2**31, 2**32 - 1]), max_size=30)
@@ -83,9 +83,10 @@ def test_the_column_of_a_cloud_is_read_at_the_places_asked_for(make):
     cloud = np.zeros(5, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("cluster_id", "<u4")])
     cloud["cluster_id"] = [9, 4_000_000_000, 0, 9, 2]
     msg = from_array(cloud, header(make), make)
-    labels, numbers = cluster_column(msg, np.array([1, 2, 3]))
+    labels, numbers = read_cluster_ids(msg, np.array([1, 2, 3]))
     assert labels.tolist() == [2, 0, 1] and numbers.tolist() == [9, 4_000_000_000]
-    assert cluster_column(from_array(cloud[["x"]].copy(), header(make), make), np.arange(5)) is None
+    without_ids = from_array(cloud[["x"]].copy(), header(make), make)
+    assert read_cluster_ids(without_ids, np.arange(5)) is None
 
 
 @pytest.mark.parametrize("size_by_id", [

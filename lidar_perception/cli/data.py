@@ -178,7 +178,7 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
         load_first_clouds,
     )
     from lidar_perception.data.open import open_recording
-    from lidar_perception.wire.messages import recorded_intensity_problem
+    from lidar_perception.wire.messages import diagnose_recorded_intensity
     recording = open_recording(data, **how)
     errors.print(str(recording), style="dim")
     for line in lost_labels(recording):
@@ -194,7 +194,7 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
             errors.print(f"its intensity is 0 .. {full:g}, read as 0 .. 1", style="dim")
         for problem in filter(None, (
                 None if recording.mounted else find_mount_problem(recording, clouds),
-                recorded_intensity_problem(recording.path, clouds))):
+                diagnose_recorded_intensity(recording.path, clouds))):
             errors.print(problem, style="yellow")
     return measured
 

@@ -47,9 +47,9 @@ from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.scoring.recorded import Answered, answered
 from lidar_perception.tracking.ego import NO_SOURCE
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError, class_ids
-from lidar_perception.wire.messages import column, to_detections, to_frame, to_truth
+from lidar_perception.wire.messages import read_column, to_detections, to_frame, to_truth
 from lidar_perception.wire.topics import POINTS
-from lidar_perception.wire.track_markers import drawn_trails
+from lidar_perception.wire.track_markers import read_trails
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import to_ns
 
@@ -258,13 +258,14 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
         for topic, _, msg in bag.messages({cloud, TRACKS} & set(bag.topics)):
             if topic == TRACKS:
                 if msg.markers and to_ns(msg.markers[0].header.stamp) == best:
-                    found, trails = from_marker_array(msg), drawn_trails(msg)
+                    found, trails = from_marker_array(msg), read_trails(msg)
             elif to_ns(msg.header.stamp) == best:
                 drawing = msg
     if drawing is None:
         return False
     frame, indices = to_frame(drawing)
-    ground, ids = column(drawing, "ground", indices), column(drawing, "cluster_id", indices)
+    ground = read_column(drawing, "ground", indices)
+    ids = read_column(drawing, "cluster_id", indices)
     none = np.zeros(len(frame), int)
     colors = None if ground is None else by_cluster(
         ground > 0, none if ids is None else renumbered(ids)[0])

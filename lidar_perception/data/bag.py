@@ -27,8 +27,8 @@ from lidar_perception.data.storage import END, START, StorageFile, Topic, in_tim
 from lidar_perception.runs.files import check_free, refuse_others, require_name
 from lidar_perception.runs.resuming import locked
 from lidar_perception.types import InputError, InputWarning
-from lidar_perception.wire.codec import decode, encode, typestore
-from lidar_perception.wire.unpacking import unpack_message
+from lidar_perception.wire.codec import decode, encode, load_typestore
+from lidar_perception.wire.compression import decompress_message
 
 __all__ = ["LATCHED_QOS", "SENSOR_QOS", "Bag", "BagWriter", "KeptOpen"]
 
@@ -97,17 +97,17 @@ class BagWriter:
                              f"could be written is in {self.partial}") from None
 
     def add_topic(self, topic: str, type_name: str, qos: dict = SENSOR_QOS) -> None:
-        definition, _ = typestore().generate_msgdef(type_name, ros_version=2)
+        definition, _ = load_typestore().generate_msgdef(type_name, ros_version=2)
         schema = self.mcap.register_schema(type_name, "ros2msg", definition.encode())
         profile = [full_profile(qos)]
         metadata = {"offered_qos_profiles": _yaml(profile),
-                    "topic_type_hash": typestore().hash_rihs01(type_name)}
+                    "topic_type_hash": load_typestore().hash_rihs01(type_name)}
         channel = self.mcap.register_channel(topic, "cdr", schema, metadata)
         self.channels[topic] = channel
         self.topics.append({"topic_metadata": {
             "name": topic, "type": type_name, "serialization_format": "cdr",
             "offered_qos_profiles": profile,
-            "type_description_hash": typestore().hash_rihs01(type_name)}, "message_count": 0})
+            "type_description_hash": load_typestore().hash_rihs01(type_name)}, "message_count": 0})
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Append a message: an object of bag_message, or CDR bytes as they are."""
@@ -281,7 +281,7 @@ class Bag:
         try:
             for topic, time, data in file.messages(names, start, stop):
                 found[topic] += 1
-                yield names[topic], time, unpack_message(data)
+                yield names[topic], time, decompress_message(data)
             for said in file.topics if start <= self.start_ns and stop == END else ():
                 if said.id in names and said.messages != found[said.id]:
                     raise ValueError(f"it says {said.messages} messages on {said.name} and holds "

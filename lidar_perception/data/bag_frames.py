@@ -35,11 +35,17 @@ from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, Lidar
 from lidar_perception.wire.clouds import (
     CLOUD_TYPES,
     check_readable,
-    cloud_topics,
     decode_cloud,
-    packets_problem,
+    diagnose_packets,
+    find_cloud_topics,
 )
-from lidar_perception.wire.messages import calibration_of, column, raw_intensity, to_frame, to_truth
+from lidar_perception.wire.messages import (
+    read_calibration,
+    read_column,
+    read_raw_intensity,
+    to_frame,
+    to_truth,
+)
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, INSTANCE, POINTS, SEMANTIC, TRUTH
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import SECOND
@@ -58,7 +64,7 @@ def recognises(path: Path) -> bool:
 def cloud_topic(bag: Bag, points: str = "") -> str:
     """The topic of a bag to take the clouds from: points, where one is named, else /points, else
     the only one with clouds. InputError where there is none, or several."""
-    every = cloud_topics(bag.topics)
+    every = find_cloud_topics(bag.topics)
     clouds = [topic for topic in every if bag.counts[topic]]
     if not points and POINTS not in clouds and len(clouds) > 1:
         raise InputError(f"{bag.path} has clouds on {', '.join(clouds)}; name the topic of one, as "
@@ -66,13 +72,13 @@ def cloud_topic(bag: Bag, points: str = "") -> str:
     if not points and not every:
         others = {name: topic.type for name, topic in bag.unreadable.items()} | bag.topics
         raise InputError(f"{bag.path} has no sensor_msgs/PointCloud2 and no other clouds: "
-                         + (packets_problem(others) or f"it has {bag.content}. Record the cloud "
+                         + (diagnose_packets(others) or f"it has {bag.content}. Record the cloud "
                             "topic of the sensor's driver"))
     chosen = points or (clouds[0] if clouds and POINTS not in clouds else POINTS)
     bag.require(chosen)
     if bag.topics[chosen] not in CLOUD_TYPES:
         raise InputError(f"{bag.path} has {bag.topics[chosen]} on {chosen}, no clouds; "
-                         + (packets_problem({chosen: bag.topics[chosen]})
+                         + (diagnose_packets({chosen: bag.topics[chosen]})
                             or f"name another topic, as in {bag.path}:/points"))
     return chosen
 
@@ -214,7 +220,7 @@ class BagFrames(Sequence):
         """The intensity of a full reflection, by the first clouds, as only they can be read without
         a look through the bag; the same for all frames."""
         return scale_of(self._first_clouds(),
-                        lambda data: raw_intensity(decode_cloud(data, self.kind)))
+                        lambda data: read_raw_intensity(decode_cloud(data, self.kind)))
 
     def _first_clouds(self) -> Iterator[bytes]:
         with suppress(InputError):  # damage is named when it is read
@@ -262,7 +268,7 @@ class BagFrames(Sequence):
             return None
         with self._named(time):
             indices = to_frame(msg)[1]
-            classes, instances = (column(msg, name, indices) for name in (SEMANTIC, INSTANCE))
+            classes, instances = (read_column(msg, name, indices) for name in (SEMANTIC, INSTANCE))
         assert classes is not None and instances is not None  # labelled() has seen both
         return PointTruth(classes.astype(np.uint16), instances.astype(np.uint16))
 
@@ -272,7 +278,7 @@ class BagFrames(Sequence):
     def _calibration(self, time: int) -> Calibration | None:
         _, infos, transforms = self._beside
         info, transform = _latest(infos, time), _latest(transforms, time)
-        return calibration_of(info, transform) if info and transform else None
+        return read_calibration(info, transform) if info and transform else None
 
 
 def _header_stamp(data: bytes) -> int | None:

@@ -16,9 +16,9 @@ from lidar_perception.robot.tree import Missing, TransformTree
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import ODOMETRY, ODOMETRY_FRAME, TF, TF_STATIC
 from lidar_perception.wire.transforms import (
+    FIXED,
     MOVING,
     ODOMETRY_MESSAGE,
-    STILL,
     TF_MESSAGE,
     add_odometry,
     add_transforms,
@@ -146,7 +146,7 @@ class BagPoses:
         return self._carrier_poses(np.array([stamp_ns]))[0]
 
     def _carrier_poses(self, times: np.ndarray) -> np.ndarray:
-        return self._odometry.poses(STILL, MOVING, times, MAX_GAP)
+        return self._odometry.poses(FIXED, MOVING, times, MAX_GAP)
 
     def _on_carrier(self, times: np.ndarray) -> np.ndarray:
         """(4, 4), or (M, 4, 4) where it moves on it: where on the carrier the sensor is at times

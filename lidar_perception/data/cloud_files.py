@@ -17,7 +17,7 @@ from lidar_perception.data.records import read_records
 from lidar_perception.runs.files import regular, short
 from lidar_perception.types import MAX_RANGE, InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import raw_intensity, to_frame
+from lidar_perception.wire.messages import read_raw_intensity, to_frame
 from msg_utils.point_cloud2 import from_array, xyz
 from msg_utils.stamps import header_message
 
@@ -36,7 +36,7 @@ def is_cloud(path: Path) -> bool:
 
 def cloud_scale(files: Sequence[Path]) -> Callable[[], float]:
     """Return the recorded_scale() of files of SUFFIXES."""
-    return recorded_scale(files, lambda file: raw_intensity(to_message(file)))
+    return recorded_scale(files, lambda file: read_raw_intensity(to_message(file)))
 
 
 def load_points(file: Path, stamp_ns: int, frame_id: str = "", *,

@@ -15,7 +15,7 @@ from lidar_perception.robot.placing import levelling, tilted
 from lidar_perception.robot.poses import inverse, moved_boxes, moved_points
 from lidar_perception.types import GroundTruth, LidarFrame
 from lidar_perception.wire.messages import to_frame
-from lidar_perception.wire.point_times import moved_to_stamp
+from lidar_perception.wire.point_times import deskew_frame
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 
@@ -51,7 +51,7 @@ def levelled(frame: Frame, robot: Robot, poses: Poses | None = None) -> Frame:
         scan, indices = to_frame(message, robot.intensity_max or frame.intensity_max())
         kept, scan = cropped(scan, robot.crop, level=level)
         if poses is not None:
-            scan = moved_to_stamp(message, scan, indices.take(kept), poses)
+            scan = deskew_frame(message, scan, indices.take(kept), poses)
         return kept, scan
 
     def load() -> LidarFrame:

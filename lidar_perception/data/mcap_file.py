@@ -21,7 +21,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.records import Channel, Schema
 
 from lidar_perception.data.storage import END, Stream, Topic, in_time_order
-from lidar_perception.wire.unpacking import MAX_UNPACKED, unpack
+from lidar_perception.wire.compression import MAX_BYTES, decompress
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
@@ -207,7 +207,7 @@ class McapFile:
 
     def _unpacked(self, chunk: Chunk) -> bytes:
         *_, packing, packed, size = chunk.place
-        data = unpack(self._read(chunk.at, packed), packing.decode(), size)
+        data = decompress(self._read(chunk.at, packed), packing.decode(), size)
         if chunk.crc and crc32(data) != chunk.crc:
             raise ValueError("the checksum of a chunk is wrong")
         return data
@@ -252,8 +252,9 @@ def _chunk(head: bytes, at: int, length: int) -> Chunk:
     start, end, size, crc = struct.unpack_from("<QQQI", head)
     packing, sizes = _string(head, 28)
     packed, = struct.unpack_from("<Q", head, sizes)
-    if size > MAX_UNPACKED:
-        raise ValueError(f"a chunk of it is said to unpack to {size} bytes")
+    if size > MAX_BYTES:
+        raise ValueError(f"a chunk declares a decompressed size of {size} bytes; at most "
+                         f"{MAX_BYTES} are allowed")
     begin, whole = at - RECORD.size, RECORD.size + length
     return Chunk((begin, whole, start, end, packing, packed, size), _checked(start), _checked(end),
                  at + sizes + 8, crc)

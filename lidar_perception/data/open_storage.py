@@ -19,7 +19,7 @@ from lidar_perception.data.sqlite_file import SqliteFile
 from lidar_perception.data.storage import StorageFile
 from lidar_perception.runs.files import regular, short
 from lidar_perception.types import InputError
-from lidar_perception.wire.unpacking import ZSTD_MAGIC
+from lidar_perception.wire.compression import ZSTD_MAGIC
 
 # Suffix -> how such a file begins, what opens it, and what may mend a damaged one.
 FORMATS: dict[str, tuple[bytes, Callable[[Path], StorageFile], str]] = {

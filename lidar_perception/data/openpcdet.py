@@ -14,7 +14,7 @@ from lidar_perception.data.frame import BOXES, Frame, Recording
 from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import CLASSES, LARGEST, GroundTruth, InputError
-from lidar_perception.wire.messages import any_class_ids
+from lidar_perception.wire.messages import to_class_ids
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 LINE = "x y z dx dy dz heading class"
@@ -70,7 +70,7 @@ def read_labels(path: Path) -> GroundTruth | None:
                              "correct or remove it") from None
         boxes.append(box)
         names.append(class_name(" ".join(words[7:])))
-    ids = any_class_ids(names)
+    ids = to_class_ids(names)
     misc = CLASSES.index("Misc")
     return GroundTruth.of(boxes, ids, [{"class_name": name} if i == misc else {}
                                        for name, i in zip(names, ids)])

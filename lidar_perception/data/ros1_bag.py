@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from lidar_perception.data.qos import LATCHED_QOS
 from lidar_perception.data.storage import Stream, Topic
 from lidar_perception.wire.clouds import LIVOX
-from lidar_perception.wire.codec import typestore
+from lidar_perception.wire.codec import load_typestore
 from lidar_perception.wire.livox import livox_ros1_to_cdr
 
 MAGIC = b"#ROSBAG V"
@@ -33,7 +33,7 @@ class Ros1File:
         for c in self.reader.connections:
             kind = STATIC_MSGTYPE_RENAMES.get(c.msgtype, c.msgtype)
             self.topics.append(Topic(
-                c.id, c.topic, kind, "cdr" if kind in typestore().fielddefs else "ros1",
+                c.id, c.topic, kind, "cdr" if kind in load_typestore().fielddefs else "ros1",
                 [LATCHED_QOS] if getattr(c.ext, "latching", 0) else [], c.msgcount))
         made: dict[str, object] = {}
         self.converted = {topic.id: self._conversion(self.recorded[topic.id].msgtype, topic.type,
@@ -58,7 +58,7 @@ class Ros1File:
     def _conversion(self, recorded: str, wanted: str, made: dict[str, object]
                     ) -> Callable[[Any], Any]:
         from rosbags.convert.converter import is_same_wireformat, migrate_bytes
-        if is_same_wireformat(self.reader.typestore, typestore(), recorded, wanted):
-            return partial(typestore().ros1_to_cdr, typename=wanted)
-        return partial(migrate_bytes, self.reader.typestore, typestore(), recorded, wanted, made,
-                       src_is2=False, dst_is2=True)
+        if is_same_wireformat(self.reader.typestore, load_typestore(), recorded, wanted):
+            return partial(load_typestore().ros1_to_cdr, typename=wanted)
+        return partial(migrate_bytes, self.reader.typestore, load_typestore(), recorded, wanted,
+                       made, src_is2=False, dst_is2=True)

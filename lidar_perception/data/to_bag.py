@@ -13,7 +13,12 @@ from lidar_perception.data.bag import LATCHED_QOS, BagWriter
 from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import camera_info, extrinsics, odometry, truth_markers
+from lidar_perception.wire.messages import (
+    make_camera_info,
+    make_extrinsics,
+    make_odometry,
+    make_truth_markers,
+)
 from lidar_perception.wire.topics import (
     CAMERA_FRAME,
     CAMERA_INFO,
@@ -124,7 +129,7 @@ class FrameWriter:
             _write_pose(bag, pose, stamp_ns, header.frame_id)
         if truth is not None:
             self._labelled.add(stamp_ns)
-            markers = truth_markers(truth, header, bag_message, self._shown)
+            markers = make_truth_markers(truth, header, bag_message, self._shown)
             self._shown = marker_keys(markers)
             bag.write(TRUTH, stamp_ns, markers)
             if self.detections_3d:
@@ -169,13 +174,13 @@ def _write_pose(bag: BagWriter, pose: np.ndarray, stamp_ns: int, frame_id: str) 
     if ODOMETRY not in bag.channels:
         bag.add_topic(ODOMETRY, "nav_msgs/msg/Odometry")
     fixed = header_message(stamp_ns, ODOMETRY_FRAME, bag_message)
-    bag.write(ODOMETRY, stamp_ns, odometry(pose, fixed, frame_id, bag_message))
+    bag.write(ODOMETRY, stamp_ns, make_odometry(pose, fixed, frame_id, bag_message))
 
 
 def _write_calibration(bag: BagWriter, calibration: Calibration, stamp_ns: int,
                        header) -> None:
     camera_header = header_message(stamp_ns, CAMERA_FRAME, bag_message)
-    transform = extrinsics(calibration, header, bag_message)
-    bag.write(CAMERA_INFO, stamp_ns, camera_info(calibration, camera_header, bag_message))
+    transform = make_extrinsics(calibration, header, bag_message)
+    bag.write(CAMERA_INFO, stamp_ns, make_camera_info(calibration, camera_header, bag_message))
     bag.write(EXTRINSICS, stamp_ns, transform)
     bag.write(TF_STATIC, stamp_ns, bag_message("tf2_msgs/msg/TFMessage", transforms=[transform]))

@@ -14,9 +14,9 @@ from lidar_perception.detecting.formats import Run
 from lidar_perception.detecting.results import FrameResult
 from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import detection_markers
+from lidar_perception.wire.messages import make_detection_markers
 from lidar_perception.wire.topics import FOUND, TRACKS
-from lidar_perception.wire.track_markers import track_markers
+from lidar_perception.wire.track_markers import make_track_markers
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import marker_keys
 
@@ -61,11 +61,11 @@ class Bag:
                 self.run.skipped.append(f"not in {self.path}: {error}")
                 return
         header, stamp_ns = content.header, content.stamp_ns
-        self._write(self.found, stamp_ns, detection_markers(
+        self._write(self.found, stamp_ns, make_detection_markers(
             result.detections, header, bag_message, self._shown.get(self.found, ())))
         self._write_3d(self.found, stamp_ns, header, result.detections)
         if self.tracks is not None and (tracks := result.tracks) is not None:
-            self._write(self.tracks, stamp_ns, track_markers(
+            self._write(self.tracks, stamp_ns, make_track_markers(
                 tracks.ids, tracks.detections, tracks.velocities, tracks.moving, result.trails,
                 header, bag_message, previous=self._shown.get(self.tracks, ())))
             self._write_3d(self.tracks, stamp_ns, header, tracks.detections, ids=tracks.ids,

@@ -21,7 +21,7 @@ from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
 from lidar_perception.nodes.transforms import STATIC_QOS
 from lidar_perception.params import PlayerParams
 from lidar_perception.types import InputError, InputWarning
-from lidar_perception.wire.clouds import POINT_CLOUD, cloud_topics, decode_cloud
+from lidar_perception.wire.clouds import POINT_CLOUD, decode_cloud, find_cloud_topics
 from lidar_perception.wire.codec import encode
 from lidar_perception.wire.transforms import TF_MESSAGE
 from msg_utils.messages import ros_message
@@ -49,7 +49,7 @@ class BagPlayer(LidarNode):
         for warning in wrong:
             self.get_logger().warning(str(warning.message))
         # Topics with clouds that are played as PointCloud2
-        self.converted = {t for t in cloud_topics(self.bag.topics)
+        self.converted = {t for t in find_cloud_topics(self.bag.topics)
                           if self.bag.topics[t] != POINT_CLOUD}
         self.kinds = {t: POINT_CLOUD if t in self.converted else kind
                       for t, kind in self.bag.topics.items()}
@@ -114,7 +114,7 @@ class BagPlayer(LidarNode):
     def _wanted(self) -> dict[str, int]:
         """Topic -> how many subscribers are waited for."""
         wanted = {}
-        own = [self.names[t] for t in cloud_topics(self.bag.topics) if t in self.names]
+        own = [self.names[t] for t in find_cloud_topics(self.bag.topics) if t in self.names]
         for rule in self.params.wait_for or own:
             name, _, count = rule.partition(":=")
             if count and not count.isdecimal():

@@ -13,7 +13,7 @@ from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, BagWriter
 from lidar_perception.nodes.runtime import OK, WARN, LidarNode
 from lidar_perception.params import RecorderParams
 from lidar_perception.types import InputError
-from lidar_perception.wire.codec import typestore
+from lidar_perception.wire.codec import load_typestore
 from msg_utils.messages import message_class
 
 LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
@@ -84,7 +84,7 @@ class BagRecorder(LidarNode):
     @staticmethod
     def _known(type_name: str) -> type | None:
         """The class of a type that can be received and written; None where there is none."""
-        if type_name not in typestore().fielddefs:
+        if type_name not in load_typestore().fielddefs:
             return None
         try:
             return message_class(type_name)

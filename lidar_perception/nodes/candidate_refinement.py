@@ -16,7 +16,7 @@ from lidar_perception.nodes.outputs import CandidateOutputs
 from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.params import DetectionNodeParams, RefinementNodeParams
 from lidar_perception.types import InputError
-from lidar_perception.wire.messages import cluster_column, column, to_frame
+from lidar_perception.wire.messages import read_cluster_ids, read_column, to_frame
 from msg_utils.stamps import to_ns
 
 __all__ = ["CandidateRefinement", "warm_up"]
@@ -38,7 +38,7 @@ class CandidateRefinement(ManagedNode):
         with self.frame(to_ns(msg.header.stamp)):
             frame, indices = to_frame(msg)
             frame = self.transforms.placing(msg.header).levelled(frame)
-            ground, clusters = column(msg, "ground", indices), cluster_column(msg, indices)
+            ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
             if clusters is None:
                 raise InputError("the cloud has no column 'cluster_id'; remap ~/input/points to "
                                  "the clustering's output")

@@ -14,7 +14,7 @@ from lidar_perception.nodes.outputs import ClusterBoxes
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.params import BoxNodeParams, ClusteringNodeParams
 from lidar_perception.wire.codec import bag_message, encode
-from lidar_perception.wire.messages import column, spread, to_frame
+from lidar_perception.wire.messages import read_column, scatter_values, to_frame
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
 
@@ -37,11 +37,11 @@ class Clustering(ManagedNode):
         with self.frame(to_ns(msg.header.stamp)):
             frame, indices = to_frame(msg)
             frame = self.transforms.placing(msg.header).levelled(frame)
-            marked = column(msg, "ground", indices)
+            marked = read_column(msg, "ground", indices)
             ground = np.zeros(len(frame), bool) if marked is None else marked > 0
             ids = cluster_obstacles(frame.xyz, ground, self.params.clustering)
             self.points.publish(encode(add_columns(
-                msg, bag_message, cluster_id=spread(ids, indices, msg, "u4"))))
+                msg, bag_message, cluster_id=scatter_values(ids, indices, msg, "u4"))))
         self.boxes.publish(msg.header, lambda: fit_grounded_boxes(
             frame.xyz, ground, ids, self.params.boxes.shape))
         self.counts["clusters"] = int(ids.max(initial=0))

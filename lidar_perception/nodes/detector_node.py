@@ -15,7 +15,7 @@ from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.runs.compiling import compilation_reported, one_at_a_time
 from lidar_perception.runs.machine import cores
 from lidar_perception.types import InputError, LidarFrame
-from lidar_perception.wire.messages import cluster_column, column
+from lidar_perception.wire.messages import read_cluster_ids, read_column
 from msg_utils.stamps import to_ns
 
 
@@ -80,7 +80,7 @@ class DetectorNode(ManagedNode):
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, indices, params = self.sensor.frame(msg, with_intensity=True)
-            ground, clusters = column(msg, "ground", indices), cluster_column(msg, indices)
+            ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
             own = getattr(params, self.group)
             self.detector.params = self._with_weak(params, own)
             found = self.detector(frame, ground=None if ground is None else ground > 0,

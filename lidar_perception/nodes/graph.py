@@ -19,7 +19,7 @@ import yaml
 
 from lidar_perception.candidates.params import STEPS
 from lidar_perception.types import InputError
-from lidar_perception.wire.clouds import cloud_topics, packets_problem
+from lidar_perception.wire.clouds import diagnose_packets, find_cloud_topics
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
 
 Graph = Mapping[str, Mapping[str, str]]  # node -> remapping of its topics
@@ -159,12 +159,12 @@ def wait_for(single: bool = False, points: int = 1, truth: int = 2,
 def chosen_clouds(bag: str, types: Mapping[str, str], wanted: str = "") -> str:
     """The topic of a bag with clouds: the wanted one, or with '' the only one. InputError names
     those that there are."""
-    clouds = cloud_topics(types)
+    clouds = find_cloud_topics(types)
     if wanted in clouds or (not wanted and len(clouds) == 1):
         return wanted or clouds[0]
     if not clouds:
         raise InputError(f"{bag} has no clouds: none of its topics is a sensor_msgs/PointCloud2"
-                         f"{'; ' + problem if (problem := packets_problem(types)) else ''}")
+                         f"{'; ' + problem if (problem := diagnose_packets(types)) else ''}")
     has = f"it has {', '.join(clouds)}"
     raise InputError(f"{bag} has no cloud on {wanted}; {has}" if wanted else
                      f"{bag}: give the topic of the clouds with points:=TOPIC; {has}")

@@ -15,7 +15,7 @@ from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import GroundNodeParams, GroundRobotParams
 from lidar_perception.wire.codec import bag_message, encode
-from lidar_perception.wire.messages import spread
+from lidar_perception.wire.messages import scatter_values
 from msg_utils.point_cloud2 import add_columns, from_array, to_array
 from msg_utils.stamps import to_ns
 
@@ -46,8 +46,8 @@ class GroundSegmentation(ManagedNode):
             ground = segment_ground(seen, params.ground)
             indices = usable.take(indices)
             self.points.publish(encode(add_columns(
-                msg, bag_message, ground=spread(ground, indices, msg, "u1"),
-                in_view=spread(1, indices, msg, "u1"))))
+                msg, bag_message, ground=scatter_values(ground, indices, msg, "u1"),
+                in_view=scatter_values(1, indices, msg, "u1"))))
         for publisher, chosen in ((self.ground, ground), (self.nonground, ~ground)):
             if publisher.get_subscription_count():
                 publisher.publish(encode(from_array(to_array(msg).take(indices[chosen]), msg.header,

@@ -32,7 +32,7 @@ from lidar_perception.nodes.runtime import (
 from lidar_perception.robot.poses import inverse, moved_boxes, moved_points
 from lidar_perception.robot.tree import Missing
 from lidar_perception.types import PEDESTRIAN, InputError
-from lidar_perception.wire.messages import calibrated, camera_of, to_truth
+from lidar_perception.wire.messages import make_calibration, read_camera, to_truth
 from lidar_perception.wire.params import ViewParams
 from lidar_perception.wire.topics import CLICK
 from msg_utils.markers import from_marker_array
@@ -80,14 +80,14 @@ class CameraInput:
         transform = self.transforms.get((lidar, camera)) or self.transforms.get((camera, lidar))
         level = self.node.transforms.placing(header).level
         if transform is not None:
-            found = camera_of(self.info, transform)
+            found = read_camera(self.info, transform)
         else:
             try:
                 pose = self.node.transforms.tree.lookup(camera, lidar, to_ns(header.stamp))
             except Missing:
                 self.node.transforms.listen()
                 return None
-            found = calibrated(self.info, pose).camera()
+            found = make_calibration(self.info, pose).camera()
         return found if level is None else replace(
             found, projection=found.projection @ inverse(level))
 

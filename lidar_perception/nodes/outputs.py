@@ -22,7 +22,7 @@ from lidar_perception.nodes.track_outputs import (
 from lidar_perception.robot.poses import inverse, moved_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.codec import bag_message, encode
-from lidar_perception.wire.messages import detection_markers, thin_cloud
+from lidar_perception.wire.messages import make_detection_markers, make_xyz_cloud
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import marker_keys, to_marker_array
 from msg_utils.messages import message_class, ros_message
@@ -81,7 +81,7 @@ class Obstacles:
             params = self.node.transforms.mounted(self.node.params, placing)
             chosen = find_obstacles(xyz, ground, self.node.robot.obstacles,
                                     params.ground.sensor_pose)
-            self.publisher.publish(encode(thin_cloud(
+            self.publisher.publish(encode(make_xyz_cloud(
                 msg, placing.in_cloud(xyz.compress(chosen, axis=0)), indices.compress(chosen),
                 bag_message)))
 
@@ -96,8 +96,8 @@ class DetectionMarkers:
     def publish(self, header: Any, detections: Detections,
                 clusters: np.ndarray | None = None) -> None:
         """In the frame of header, as they are."""
-        message = detection_markers(detections, header, bag_message, self.shown,
-                                    lifetime_ns(self.node), clusters)
+        message = make_detection_markers(detections, header, bag_message, self.shown,
+                                         lifetime_ns(self.node), clusters)
         self.shown = marker_keys(message)
         self.publisher.publish(encode(message))
 

@@ -30,7 +30,7 @@ from lidar_perception.nodes.declared import as_declared, declare
 from lidar_perception.nodes.reception import Problem, Reception
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.types import InputError, closest_name
-from lidar_perception.wire.codec import bag_message, decode, encode, typestore
+from lidar_perception.wire.codec import bag_message, decode, encode, load_typestore
 from msg_utils.messages import message_class
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -315,7 +315,7 @@ class LidarNode(Node):
 
 
 def decoded(data: bytes, type_name: str) -> Any:
-    if type_name in typestore().fielddefs:
+    if type_name in load_typestore().fielddefs:
         return decode(data, type_name)
     return deserialize_message(data, message_class(type_name))
 
@@ -343,5 +343,5 @@ def _kind_of(message: str) -> str:
 
 def _warm_up_type(type_name: str) -> None:
     """rosbags writes its code for a type on first use: do that before the first message."""
-    if type_name in typestore().fielddefs:
+    if type_name in load_typestore().fielddefs:
         decode(encode(bag_message(type_name)), type_name)

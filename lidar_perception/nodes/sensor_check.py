@@ -13,7 +13,7 @@ from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.intensity import StreamScale
 from lidar_perception.robot.params import CropParams
 from lidar_perception.types import LidarFrame
-from lidar_perception.wire.messages import intensity_problem, to_frame
+from lidar_perception.wire.messages import diagnose_intensity, to_frame
 
 CLOUDS = 5  # on which the height is measured
 
@@ -48,7 +48,7 @@ class SensorCheck:
     def problem(self, frame: LidarFrame, params: Any) -> str | None:
         """What does not fit the parameters that frame() gave, with the remedy; None if nothing is
         known against them."""
-        return self.height_problem(frame, params.ground.sensor_pose) or intensity_problem(frame)
+        return self.height_problem(frame, params.ground.sensor_pose) or diagnose_intensity(frame)
 
     def height_problem(self, frame: LidarFrame, pose: SensorPoseParams) -> str | None:
         """Say that the sensor is mounted at another height than pose has, by the first clouds, with

@@ -18,7 +18,7 @@ from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.codec import bag_message, encode
-from lidar_perception.wire.track_markers import track_markers
+from lidar_perception.wire.track_markers import make_track_markers
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import marker_keys
 from msg_utils.messages import message_class, ros_message
@@ -82,7 +82,7 @@ class TrackOutputs:
     def _send(self, header: Any, stamp: int, tracks: Tracks) -> None:
         output = self.node.robot.output
         trails = self.trails(tracks, self.tracker.pose, stamp, output.trail)
-        message = track_markers(
+        message = make_track_markers(
             tracks.ids, tracks.detections, tracks.velocities, tracks.moving, trails, header,
             bag_message, previous=self.shown, lifetime_ns=lifetime_ns(self.node),
             extras=[{"seen": bool(seen), "age": round(float(age), 3)}

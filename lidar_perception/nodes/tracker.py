@@ -10,7 +10,7 @@ from lidar_perception.nodes.runtime import MARKERS, OK, WARN
 from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, has_detections_3d
 from lidar_perception.params import TrackerNodeParams, TrackInputParams
 from lidar_perception.types import InputError
-from lidar_perception.wire.messages import to_detections, unknown_names
+from lidar_perception.wire.messages import find_unknown_classes, to_detections
 from msg_utils.detections import from_detection_array
 from msg_utils.markers import MarkedObjects, array_header, from_marker_array
 from msg_utils.stamps import to_ns
@@ -47,7 +47,7 @@ class TrackerNode(ManagedNode):
         with self.frame(to_ns(header.stamp)):
             problem = self.tracks.publish(header, to_detections(objects))
         said = [problem] if problem else []
-        if unknown := unknown_names(objects.labels):
+        if unknown := find_unknown_classes(objects.labels):
             said.append(f"detections of the classes {', '.join(unknown)[:80]} are tracked as Misc: "
                         f"call them {', '.join(DETECTED)} in markers' ns or in class_id")
         self.report(WARN if said else OK, "; ".join(said) or "tracking")

@@ -25,12 +25,12 @@ from lidar_perception.robot.tree import Missing, TransformTree
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_frame
-from lidar_perception.wire.point_times import corrected, moved_cloud, point_times
+from lidar_perception.wire.point_times import deskew_points, read_point_times, replace_points
 from lidar_perception.wire.topics import TF, TF_STATIC
 from lidar_perception.wire.transforms import (
+    FIXED,
     MOVING,
     ODOMETRY_MESSAGE,
-    STILL,
     TF_MESSAGE,
     add_odometry,
     add_transforms,
@@ -169,7 +169,7 @@ class Transforms:
         not wait for the end of its turn otherwise."""
         if self.sweep is None:
             try:
-                seconds = point_times(cloud, to_frame(cloud)[1]).seconds
+                seconds = read_point_times(cloud, to_frame(cloud)[1]).seconds
             except InputError:  # corrected() says it
                 return 0.0
             self.sweep = float(seconds[np.isfinite(seconds)].max(initial=0.0))
@@ -275,9 +275,9 @@ class Transforms:
             raise Missing(f"nothing has come on {self.node.resolve_topic_name('~/input/odometry')}"
                           "; remap it to the odometry's topic")
         try:
-            return self.odometry.poses(STILL, MOVING, at, max_gap)
+            return self.odometry.poses(FIXED, MOVING, at, max_gap)
         except Missing as error:
-            said = str(error).replace(STILL, self.odometry_frame).replace(MOVING, self.carrier)
+            said = str(error).replace(FIXED, self.odometry_frame).replace(MOVING, self.carrier)
             raise Missing(f"{self.node.resolve_topic_name('~/input/odometry')}: {said}",
                           error.late) from None
 
@@ -345,11 +345,11 @@ class Transforms:
             self.sweep = float(at.max() - frame.stamp_ns) / SECOND
             return self.sensor_poses(self.node.robot.input.deskew, frame.frame_id, at)
 
-        found = corrected(msg, frame, indices, poses)
+        found = deskew_points(msg, frame, indices, poses)
         if found is None:
             return msg
         known, moved, times = found
-        return moved_cloud(msg, bag_message, indices.take(known), moved, times)
+        return replace_points(msg, bag_message, indices.take(known), moved, times)
 
     # For the diagnostics
 

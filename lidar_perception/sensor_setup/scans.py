@@ -12,7 +12,7 @@ from lidar_perception.intensity import INTENSITY_FIELDS, MAX_UNIT, full_scale
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import to_frame
 from lidar_perception.wire.point_times import NAMES as TIMES
-from lidar_perception.wire.point_times import point_times
+from lidar_perception.wire.point_times import read_point_times
 from msg_utils.point_cloud2 import to_array
 
 # As Velodyne and Ouster, Hesai and Nebula, Livox, RoboSense and others call the number of the beam.
@@ -64,7 +64,7 @@ def scan_of(msg: Any, name: str = "the cloud") -> Scan:
     seconds, problem = None, ""
     if any(column in columns for column in TIMES):
         try:
-            seconds = point_times(msg, indices).seconds
+            seconds = read_point_times(msg, indices).seconds
         except InputError as error:
             problem = str(error)
     ground_range = np.hypot(xyz[:, 0], xyz[:, 1])

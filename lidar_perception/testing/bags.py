@@ -15,7 +15,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.testing.detections import objects_of
 from lidar_perception.types import CLASSES, GroundTruth, InputError, LidarFrame
-from lidar_perception.wire.codec import typestore
+from lidar_perception.wire.codec import load_typestore
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 START_NS = 1_700_000_000 * 10**9
@@ -70,7 +70,7 @@ def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = 
     with Bag(source) as recorded, Writer(path, version=9,
                                          storage_plugin=STORAGES[storage]) as bag:
         copies = {topic: bag.add_connection(
-            names.get(topic, topic), kind, typestore=typestore(),
+            names.get(topic, topic), kind, typestore=load_typestore(),
             offered_qos_profiles=recorded.qos(topic)) for topic, kind in recorded.topics.items()}
         for topic, stamp, data in recorded.raw():
             bag.write(copies[topic], stamp, data)

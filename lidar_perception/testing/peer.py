@@ -13,7 +13,7 @@ from lidar_perception.nodes.graph import Graph, outputs_in_use
 from lidar_perception.nodes.runtime import RELIABLE, QoSProfile
 from lidar_perception.nodes.watch import Outside, parameters_of, values_of
 from lidar_perception.testing.processes import NodesUnderTest
-from lidar_perception.wire.codec import decode, encode, typestore
+from lidar_perception.wire.codec import decode, encode, load_typestore
 from msg_utils.messages import message_class
 
 __tracebackhide__ = True  # pytest shows the line of the test that waited
@@ -39,7 +39,7 @@ class Peer(Outside):
     def listen(self, topic: str, kind: str | type, qos: QoSProfile = RELIABLE) -> list:
         """A list that grows with the messages of a topic."""
         name, cls = _named(kind)
-        known = name in typestore().fielddefs
+        known = name in load_typestore().fielddefs
         return self._listen(topic, cls, (lambda data: decode(data, name)) if known else None, qos)
 
     def listen_raw(self, topic: str, kind: str | type, qos: QoSProfile = RELIABLE) -> list[bytes]:

@@ -1,1 +1,1 @@
-"""Messages to the core's types and back, without ROS."""
+"""Conversion between ROS messages and the types of the library, without ROS."""

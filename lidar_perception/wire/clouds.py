@@ -1,4 +1,4 @@
-"""Messages that hold a cloud: PointCloud2, its compressed form, and Livox CustomMsg."""
+"""Messages that contain a point cloud: PointCloud2, compressed clouds and Livox CustomMsg."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import LIVOX_PACKAGES, bag_message, decode
-from lidar_perception.wire.livox import livox_cloud
-from lidar_perception.wire.unpacking import unpack
+from lidar_perception.wire.compression import decompress
+from lidar_perception.wire.livox import decode_livox
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 COMPRESSED = "point_cloud_interfaces/msg/CompressedPointCloud2"
@@ -18,8 +18,8 @@ LIVOX = tuple(f"{package}/msg/CustomMsg" for package in LIVOX_PACKAGES)
 CLOUD_TYPES = (POINT_CLOUD, COMPRESSED, *LIVOX)
 COMPRESSIONS = ("zlib", "zstd")
 
-# Package of other messages of a sensor -> what makes clouds of them.
-DRIVERS = {
+# Driver that turns the packets of a sensor into clouds, by the package of the packet messages.
+DRIVER_BY_PACKAGE = {
     "velodyne_msgs": "velodyne_pointcloud (velodyne_transform_node)",
     "ouster_msgs": "ouster_ros (replay.launch.xml)",
     "ouster_ros": "ouster_ros (replay.launch.xml)",
@@ -37,63 +37,86 @@ DRIVERS = {
 
 
 def decode_cloud(data: bytes, kind: str) -> Any:
-    """Return the PointCloud2 (rosbags' class) of a message in CDR, whose type is one of
-    CLOUD_TYPES. InputError where it is broken, or compressed in a way that is not read."""
+    """Decode a serialized cloud message and return it as PointCloud2.
+
+    Args:
+        data: the message, in CDR.
+        kind: its type, one of CLOUD_TYPES.
+
+    Returns:
+        A sensor_msgs/PointCloud2 of rosbags' class.
+
+    Raises:
+        InputError: the message is damaged, or its compression is not supported.
+    """
     if kind in LIVOX:
-        return livox_cloud(data)
+        return decode_livox(data)
     msg = decode(data, kind)
-    return _unpacked(msg) if kind == COMPRESSED else msg
+    return _decompress(msg) if kind == COMPRESSED else msg
 
 
 def check_readable(data: bytes, kind: str) -> None:
-    """Raise InputError, with a remedy, for a cloud that is compressed in a way that is not read; a
-    broken message passes."""
+    """Raise InputError, with the remedy, if the compression of a cloud message is not supported.
+
+    Damaged messages pass: they are reported when they are decoded.
+    """
     if kind == COMPRESSED:
         try:
             msg = decode(data, kind)
         except InputError:
             return
-        _compression(msg)
+        _check_compression(msg)
 
 
-def cloud_topics(topics: Mapping[str, str]) -> list[str]:
-    """Return the topics with clouds, of name -> type, by name. A compressed form of another one
-    (/points/zlib beside /points) is left out."""
+def find_cloud_topics(topics: Mapping[str, str]) -> list[str]:
+    """Return the sorted names of the topics that carry clouds.
+
+    A compressed copy of another cloud topic (/points/zlib next to /points) is left out.
+
+    Args:
+        topics: type of each topic, by its name.
+    """
     clouds = {topic for topic, kind in topics.items() if kind in CLOUD_TYPES}
     return sorted(topic for topic in clouds
                   if topics[topic] != COMPRESSED or topic.rpartition("/")[0] not in clouds)
 
 
-def packets_problem(topics: Mapping[str, str]) -> str | None:
-    """Return a sentence with the remedy if one of the topics, name -> type, has the raw packets of
-    a sensor; None otherwise."""
+def diagnose_packets(topics: Mapping[str, str]) -> str | None:
+    """Explain that a topic carries the raw packets of a sensor or an unsupported scan type.
+
+    Args:
+        topics: type of each topic, by its name.
+
+    Returns:
+        One sentence with the remedy, or None if no topic is of this kind.
+    """
     for topic, kind in sorted(topics.items()):
         package, _, name = kind.replace("/msg/", "/").partition("/")
-        if driver := DRIVERS.get(package):
-            return (f"{kind} on {topic} has the raw packets of a sensor, which are not read: play "
-                    f"the bag to {driver} and record the clouds that it publishes")
+        if driver := DRIVER_BY_PACKAGE.get(package):
+            return (f"{kind} on {topic} carries raw packets of a sensor, which cannot be read: "
+                    f"play the bag to {driver} and record the clouds that it publishes")
         if package == "sensor_msgs" and name in ("PointCloud", "LaserScan"):
-            return (f"{kind} on {topic} is not read: record its scans as PointCloud2, with "
+            return (f"{kind} on {topic} cannot be read: record its scans as PointCloud2, with "
                     f"{'laser_geometry' if name == 'LaserScan' else 'point_cloud_converter'}")
     return None
 
 
-def _compression(msg: Any) -> str:
+def _check_compression(msg: Any) -> str:
     name: str = msg.format.strip().lower()
     if name not in COMPRESSIONS:
-        raise InputError(f"clouds compressed by {name or 'nothing known'} are not read, only by "
+        raise InputError(f"cloud compression '{name}' is not supported; supported are "
                          f"{' and '.join(COMPRESSIONS)}: play the bag to 'ros2 run "
                          "point_cloud_transport republish --ros-args -p in_transport:="
                          f"{name or 'NAME'} -p out_transport:=raw' and record its output")
     return name
 
 
-def _unpacked(msg: Any) -> Any:
-    packing = _compression(msg)
+def _decompress(msg: Any) -> Any:
+    compression = _check_compression(msg)
     try:
-        data = unpack(msg.compressed_data.tobytes(), packing, None)
-    except Exception as error:  # zlib and zstandard raise their own
-        raise InputError(f"a cloud compressed by {packing} is broken ({error})") from None
+        data = decompress(msg.compressed_data.tobytes(), compression, None)
+    except Exception as error:  # zlib and zstandard raise their own types
+        raise InputError(f"a {compression}-compressed cloud is damaged ({error})") from None
     return bag_message(POINT_CLOUD, data=np.frombuffer(data, np.uint8), **{
         name: getattr(msg, name) for name in (
             "header", "height", "width", "fields", "is_bigendian", "point_step", "row_step",

@@ -1,4 +1,4 @@
-"""Messages to CDR bytes and back, without ROS: the classes of rosbags, for nodes and bags alike."""
+"""CDR serialization of ROS messages without ROS, with the message classes of rosbags."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rosbags.typesys.store import Typestore
 
 from lidar_perception.types import InputError
 
-# Types that rosbags does not come with: Jazzy's vision_msgs, and clouds of other packages.
+# Types that are missing in rosbags: Jazzy's vision_msgs, and clouds of other packages.
 LIVOX_PACKAGES = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
 LIVOX = {
     "CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\n"
@@ -39,8 +39,8 @@ MORE_TYPES = {
 
 
 @functools.cache
-def typestore() -> Typestore:
-    """Return the message types of ROS 2 Jazzy that rosbags knows, and MORE_TYPES."""
+def load_typestore() -> Typestore:
+    """Return the typestore of ROS 2 Jazzy, extended by MORE_TYPES."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in MORE_TYPES.items():
         store.register(get_types_from_msg(text, name))
@@ -48,26 +48,29 @@ def typestore() -> Typestore:
 
 
 def bag_message(type_name: str, /, **fields: Any) -> Any:
-    """A message of rosbags' own class; fields that are not given are zero, empty or False."""
+    """Create a message of rosbags' class; fields that are not given are zero, empty or False."""
     names = {}
-    for name, kind in typestore().fielddefs[type_name][1]:
+    for name, kind in load_typestore().fielddefs[type_name][1]:
         names[name] = fields.pop(name) if name in fields else _zero(kind)
     if fields:
         raise TypeError(f"{type_name} has no field {next(iter(fields))!r}")
-    return typestore().types[type_name](**names)
+    return load_typestore().types[type_name](**names)
 
 
 def encode(message: Any) -> bytes:
-    """CDR of a message of rosbags' class."""
-    return bytes(typestore().serialize_cdr(message, message.__msgtype__))
+    """Serialize a message of rosbags' class to CDR."""
+    return bytes(load_typestore().serialize_cdr(message, message.__msgtype__))
 
 
 def decode(data: bytes, type_name: str) -> Any:
-    """Message of rosbags' class from CDR; arrays are views of data. InputError if it is broken."""
+    """Deserialize CDR to a message of rosbags' class.
+
+    Arrays in the message are views of `data`. Raises InputError if the data are damaged.
+    """
     try:
-        return typestore().deserialize_cdr(data, type_name)
-    except Exception as error:  # rosbags raises whatever struct, numpy or its own code raise
-        raise InputError(f"{len(data)} bytes are no {type_name} ({error})") from None
+        return load_typestore().deserialize_cdr(data, type_name)
+    except Exception as error:  # rosbags passes on the errors of struct and numpy
+        raise InputError(f"{len(data)} bytes are not a valid {type_name} ({error})") from None
 
 
 def _zero(kind: tuple[Any, Any]) -> Any:

@@ -1,4 +1,4 @@
-"""ROS messages <-> the core's types, for nodes and bags alike (either kind of message class)."""
+"""Conversion between ROS messages (of rclpy or rosbags) and the types of the library."""
 
 from __future__ import annotations
 
@@ -28,17 +28,27 @@ from msg_utils.markers import MarkedObjects, to_marker_array
 from msg_utils.point_cloud2 import CloudError, columns, from_array, to_array, xyz
 from msg_utils.stamps import to_ns
 
-MAX_ID = 2**31  # a marker's id is an int32
+MAX_ID = 2**31  # marker ids are int32
 FullScale = Callable[[np.ndarray, DTypeLike], float]  # see intensity.full_scale
 
 
 def to_frame(msg: Any, intensity_max: float | None = None,
              scale: FullScale = full_scale) -> tuple[LidarFrame, np.ndarray]:
-    """Return the usable points of a PointCloud2 and their indices (N,) in the cloud; if the cloud
-    has a column in_view, only the points where it is not 0. InputError for a broken cloud.
+    """Convert a PointCloud2 to a LidarFrame of its usable points.
 
-    intensity_max: the value of a full reflection; 0: what scale says; None: intensity is not read.
-    scale: infers it; full_scale looks at this cloud alone, a StreamScale at those before it, too.
+    If the cloud has a column `in_view`, points where it is 0 are left out.
+
+    Args:
+        intensity_max: value of a full reflection; 0: as inferred by `scale`; None: do not read the
+            intensity.
+        scale: infers the value of a full reflection, from this cloud alone (full_scale) or from all
+            clouds of a stream (StreamScale).
+
+    Returns:
+        The frame, and the indices (N,) of its points in the cloud.
+
+    Raises:
+        InputError: the cloud is malformed.
     """
     try:
         points = to_array(msg)
@@ -47,7 +57,7 @@ def to_frame(msg: Any, intensity_max: float | None = None,
             indices = np.flatnonzero(_single(points, "in_view"))
             points = points.take(indices)
         coordinates = xyz(points)
-        intensity = None if intensity_max is None else _intensity(points, intensity_max, scale)
+        intensity = None if intensity_max is None else _read_intensity(points, intensity_max, scale)
     except CloudError as error:
         raise InputError(str(error)) from None
     usable = usable_returns(coordinates)
@@ -60,57 +70,78 @@ def to_frame(msg: Any, intensity_max: float | None = None,
     return frame, np.arange(len(points)) if indices is None else indices
 
 
-def _intensity(points: np.ndarray, full: float, scale: FullScale) -> np.ndarray | None:
-    """(N,) float32, see intensity.to_unit; None without such a field."""
-    if (raw := _raw_intensity(points)) is None:
+def _read_intensity(points: np.ndarray, full: float, scale: FullScale) -> np.ndarray | None:
+    """Return intensities (N,) float32 0..1 (see intensity.to_unit); None without such a field."""
+    if (raw := _read_raw_intensity(points)) is None:
         return None
     values, kind = raw
     return to_unit(values, full or scale(values, kind))
 
 
-def _raw_intensity(points: np.ndarray) -> tuple[np.ndarray, np.dtype] | None:
+def _read_raw_intensity(points: np.ndarray) -> tuple[np.ndarray, np.dtype] | None:
     name = next((n for n in INTENSITY_FIELDS if n in (points.dtype.names or ())), None)
     return None if name is None else (columns(points, (name,))[:, 0], points.dtype[name])
 
 
-def raw_intensity(msg: Any) -> tuple[np.ndarray, np.dtype] | None:
-    """Return the intensities (N,) float32 of all points of a PointCloud2 as the driver wrote them,
-    and their type in the message; None without such a field. InputError for a broken cloud."""
+def read_raw_intensity(msg: Any) -> tuple[np.ndarray, np.dtype] | None:
+    """Read the intensities of all points of a PointCloud2 as the driver wrote them.
+
+    Returns:
+        The values (N,) float32 and their dtype in the message; None without such a field.
+
+    Raises:
+        InputError: the cloud is malformed.
+    """
     try:
-        return _raw_intensity(to_array(msg))
+        return _read_raw_intensity(to_array(msg))
     except CloudError as error:
         raise InputError(str(error)) from None
 
 
-def intensity_problem(frame: LidarFrame) -> str | None:
-    """Return the scale_problem() of a frame's intensity."""
+def diagnose_intensity(frame: LidarFrame) -> str | None:
+    """Return a message if the intensity scale of a frame is implausible, else None."""
     return scale_problem(frame.intensity)
 
 
-def recorded_intensity_problem(source: Any, clouds: Sequence[LidarFrame]) -> str | None:
-    """Return the scale_problem() of some clouds of a recording, the source, all together."""
-    found = [cloud.intensity for cloud in clouds if cloud.intensity is not None]
-    problem = scale_problem(np.concatenate(found)) if found else None
-    return problem and f"{source}: {problem}; a bag or cloud files need convert --robot then"
+def diagnose_recorded_intensity(source: Any, clouds: Sequence[LidarFrame]) -> str | None:
+    """Return a message if the intensity scale of a recording is implausible, else None.
+
+    Args:
+        source: name of the recording, for the message.
+        clouds: a sample of its clouds, judged together.
+    """
+    intensities = [cloud.intensity for cloud in clouds if cloud.intensity is not None]
+    problem = scale_problem(np.concatenate(intensities)) if intensities else None
+    return problem and (f"{source}: {problem}; for a bag or cloud files, set it with "
+                        "convert --robot")
 
 
-def spread(values: np.ndarray | int, indices: np.ndarray, msg: Any, dtype: str) -> np.ndarray:
-    """Values (N,) at indices (N,) as a column of the whole cloud msg; 0 elsewhere."""
+def scatter_values(values: np.ndarray | int, indices: np.ndarray, msg: Any,
+                   dtype: str) -> np.ndarray:
+    """Return a column for all points of a cloud: values (N,) at indices (N,), 0 elsewhere."""
     column = np.zeros(msg.height * msg.width, dtype)
     column[indices] = values
     return column
 
 
-def column(msg: Any, name: str, indices: np.ndarray) -> np.ndarray | None:
-    """(N,) values of a field at indices (N,); None where the cloud has no such field. InputError if
-    it holds more than one number a point."""
+def read_column(msg: Any, name: str, indices: np.ndarray) -> np.ndarray | None:
+    """Return the values (N,) of a field at indices (N,), or None if the cloud has no such field.
+
+    Raises InputError if the field has more than one number per point.
+    """
     points = to_array(msg)
     return _single(points, name).take(indices) if name in (points.dtype.names or ()) else None
 
 
-def thin_cloud(msg: Any, xyz: np.ndarray, indices: np.ndarray, make: Any) -> Any:
-    """PointCloud2 with the header of msg and x y z (M, 3), and intensity where msg has one, as it
-    is there at indices (M,); all of them float32."""
+def make_xyz_cloud(msg: Any, xyz: np.ndarray, indices: np.ndarray, make: Any) -> Any:
+    """Make a PointCloud2 with float32 fields x, y, z, and intensity if `msg` has one.
+
+    Args:
+        msg: cloud that gives the header and the intensity.
+        xyz: (M, 3) coordinates of the new points.
+        indices: (M,) indices of these points in `msg`, where their intensity is read.
+        make: creates messages, see msg_utils.messages.
+    """
     names = to_array(msg).dtype.names or ()
     fields = {axis: xyz[:, i] for i, axis in enumerate("xyz")}
     for name in [n for n in INTENSITY_FIELDS if n in names][:1]:
@@ -122,39 +153,56 @@ def thin_cloud(msg: Any, xyz: np.ndarray, indices: np.ndarray, make: Any) -> Any
     return from_array(points, msg.header, make)
 
 
-def cluster_column(msg: Any, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """labels (N,) int32 of the points at indices (N,), 0 none and 1..K, from the column cluster_id
-    of whatever clustering, and numbers (K,) int64, the ids there (see groups.renumbered); None
-    where the cloud has no such column. InputError if it holds no ids."""
-    ids = column(msg, "cluster_id", indices)
+def read_cluster_ids(msg: Any, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Read the column `cluster_id` of a cloud, written by any clustering.
+
+    Returns:
+        labels (N,) int32 of the points at indices (N,), 0 for noise and 1..K, and the ids (K,)
+            int64 of these clusters in the cloud (see groups.renumbered). None if the cloud has no
+            such column.
+
+    Raises:
+        InputError: the column does not hold ids.
+    """
+    ids = read_column(msg, "cluster_id", indices)
     return None if ids is None else renumbered(ids)
 
 
 def _single(points: np.ndarray, name: str) -> np.ndarray:
-    """(N,) values of a field with one number a point; InputError if it has more."""
+    """Return the values (N,) of a field; raise InputError if it has several numbers per point."""
     if points.dtype[name].shape:
-        raise InputError(f"field '{name}' has count > 1; a single number is needed")
+        raise InputError(f"field '{name}' has count > 1; it must have one number per point")
     return points[name]
 
 
-def calibration_of(info: Any, transform: Any) -> Calibration:
-    """From CameraInfo and the TransformStamped between the LiDAR frame and the camera's, in either
-    direction. InputError when P is empty or the frames do not fit."""
+def read_calibration(info: Any, transform: Any) -> Calibration:
+    """Return the calibration of a camera from its CameraInfo and its extrinsics.
+
+    Args:
+        info: sensor_msgs/CameraInfo.
+        transform: geometry_msgs/TransformStamped between the LiDAR frame and the camera frame, in
+            either direction.
+
+    Raises:
+        InputError: P is empty, or the frame names of the two messages do not match.
+    """
     t, q = transform.transform.translation, transform.transform.rotation
     lidar_to_camera = poses.pose_of(*poses.checked(
         (t.x, t.y, t.z), (q.x, q.y, q.z, q.w), "the LiDAR-to-camera transform"))
     parent, child = transform.header.frame_id, transform.child_frame_id
-    if info.header.frame_id != parent:  # it is the camera's pose in the LiDAR frame: turn it round
+    if info.header.frame_id != parent:  # it is the camera's pose in the LiDAR frame: invert it
         if info.header.frame_id != child:
             raise InputError(f"CameraInfo is in frame '{info.header.frame_id}' but the transform "
                              f"links '{parent}' and '{child}'")
         lidar_to_camera = poses.inverse(lidar_to_camera)
-    return calibrated(info, lidar_to_camera)
+    return make_calibration(info, lidar_to_camera)
 
 
-def calibrated(info: Any, lidar_to_camera: np.ndarray) -> Calibration:
-    """From CameraInfo and the pose (4, 4) of the LiDAR in the camera's frame. InputError when P is
-    empty."""
+def make_calibration(info: Any, lidar_to_camera: np.ndarray) -> Calibration:
+    """Return the calibration from CameraInfo and the pose (4, 4) of the LiDAR in the camera frame.
+
+    Raises InputError if P is empty.
+    """
     intrinsics = np.asarray(info.p, float).reshape(3, 4)
     if intrinsics[0, 0] <= 0 or info.width == 0 or info.height == 0:
         raise InputError("CameraInfo has no projection matrix P or no image size; calibrate the "
@@ -162,21 +210,21 @@ def calibrated(info: Any, lidar_to_camera: np.ndarray) -> Calibration:
     return Calibration(intrinsics, lidar_to_camera, int(info.width), int(info.height))
 
 
-def camera_of(info: Any, transform: Any) -> Camera:
-    """The camera of calibration_of."""
-    return calibration_of(info, transform).camera()
+def read_camera(info: Any, transform: Any) -> Camera:
+    """Return the camera described by CameraInfo and extrinsics, see read_calibration."""
+    return read_calibration(info, transform).camera()
 
 
-def camera_info(calibration: Calibration, header: Any, make: Any) -> Any:
-    """CameraInfo of the calibration's rectified image, without distortion."""
+def make_camera_info(calibration: Calibration, header: Any, make: Any) -> Any:
+    """Make the CameraInfo of a rectified image, without distortion."""
     p = calibration.intrinsics
     return make("sensor_msgs/msg/CameraInfo", header=header, height=calibration.height,
                 width=calibration.width, distortion_model="plumb_bob", d=np.zeros(5),
                 k=p[:, :3].ravel().copy(), r=np.eye(3).ravel(), p=p.ravel().copy())
 
 
-def extrinsics(calibration: Calibration, header: Any, make: Any) -> Any:
-    """TransformStamped: the camera frame in the LiDAR frame of header."""
+def make_extrinsics(calibration: Calibration, header: Any, make: Any) -> Any:
+    """Make a TransformStamped: the pose of the camera frame in the LiDAR frame of `header`."""
     rotation, translation = calibration.pose
     x, y, z = map(float, translation)
     qx, qy, qz, qw = map(float, rotation)
@@ -187,9 +235,12 @@ def extrinsics(calibration: Calibration, header: Any, make: Any) -> Any:
                                              w=qw)))
 
 
-def truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any = ()) -> Any:
-    """MarkerArray of the labels. Objects keep the marker id of their track, and the name of a class
-    that is not known, see to_truth."""
+def make_truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any = ()) -> Any:
+    """Make the MarkerArray of labels.
+
+    Objects keep the id of their track as marker id where these are unique, and the name of an
+    unknown class (see to_truth). `previous` is as in to_marker_array.
+    """
     labels = [str(extra.get("class_name", label))
               for label, extra in zip(truth.labels, truth.extras)]
     tracks: list[Any] = [extra.get("track_id") for extra in truth.extras]
@@ -200,60 +251,71 @@ def truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any = ()
                            extras=truth.extras, notes=truth.notes, previous=previous)
 
 
-def any_class_ids(names: Iterable[str]) -> list[int]:
-    """Into CLASSES, of what any stack calls them; an unknown name is Misc."""
+def to_class_ids(names: Iterable[str]) -> list[int]:
+    """Return the indices into CLASSES of class names of any software stack; Misc if unknown."""
     return [CALLED.get(name.casefold(), CLASSES.index("Misc")) for name in names]
 
 
-def unknown_names(names: Iterable[str]) -> list[str]:
-    """Those that any_class_ids does not know, each once."""
+def find_unknown_classes(names: Iterable[str]) -> list[str]:
+    """Return the sorted names that to_class_ids does not know."""
     return sorted({name for name in names if name.casefold() not in CALLED})
 
 
 def to_truth(objects: MarkedObjects) -> GroundTruth:
-    """Labels from markers; objects of unknown class are Misc, with their own in extras'
-    class_name."""
+    """Convert markers to labels.
+
+    Objects of an unknown class become Misc and keep their name in extras["class_name"].
+    """
     extras = [{"class_name": label, **extra} if label not in CLASSES else extra
               for label, extra in zip(objects.labels, objects.extras)]
     return GroundTruth.of(objects.boxes, class_ids(objects.labels), extras, objects.notes)
 
 
 def to_detections(objects: MarkedObjects) -> Detections:
-    """Detections from markers; objects of unknown class are Misc."""
-    return Detections.of(objects.boxes, np.array(any_class_ids(objects.labels), np.int32),
+    """Convert markers to detections; objects of an unknown class become Misc."""
+    return Detections.of(objects.boxes, np.array(to_class_ids(objects.labels), np.int32),
                          objects.scores)
 
 
-def detection_markers(detections: Detections, header: Any, make: Any, previous: Any = (),
-                      lifetime_ns: int = 0, clusters: np.ndarray | None = None) -> Any:
-    """MarkerArray of K detections, with their ids in the text too, what each of their sources says
-    where it says something, and the cluster_id (K,) of each where it is one cluster of the cloud: a
-    marker's own id has 32 bits, which not every cluster_id fits. previous and lifetime_ns as in
-    to_marker_array."""
+def make_detection_markers(detections: Detections, header: Any, make: Any, previous: Any = (),
+                           lifetime_ns: int = 0, clusters: np.ndarray | None = None) -> Any:
+    """Make the MarkerArray of K detections.
+
+    The text of each marker is JSON with the id, the probability given by each of its sources, and
+    the `cluster_id`. The cluster id is there because a marker id has 32 bits only.
+
+    Args:
+        previous, lifetime_ns: as in to_marker_array.
+        clusters: (K,) ids in the column `cluster_id` of the cloud, if each detection is one
+            cluster.
+    """
     labels = [CLASSES[i] for i in detections.class_ids]
     texts: list[dict[str, Any]] = [{"id": i} for i in range(len(detections))]
     if detections.sources:
         for i, text in enumerate(texts):
-            text["sources"] = {name: round(float(said[i]), 3) for name, said
-                               in detections.sources.items() if np.isfinite(said[i])}
+            text["sources"] = {name: round(float(scores[i]), 3) for name, scores
+                               in detections.sources.items() if np.isfinite(scores[i])}
     for text, cluster in zip(texts, () if clusters is None else clusters):
         text["cluster_id"] = int(cluster)
     return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,
                            extras=texts, previous=previous, lifetime_ns=lifetime_ns)
 
 
-def odometry(pose: np.ndarray, header: Any, moving_frame: str, make: Any) -> Any:
-    """nav_msgs/Odometry: the pose (4, 4) of moving_frame in the frame of header."""
+def make_odometry(pose: np.ndarray, header: Any, moving_frame: str, make: Any) -> Any:
+    """Make a nav_msgs/Odometry: the pose (4, 4) of `moving_frame` in the frame of `header`."""
     x, y, z = map(float, pose[:3, 3])
     qx, qy, qz, qw = map(float, Rotation.from_matrix(pose[:3, :3]).as_quat())
-    place = make("geometry_msgs/msg/Pose", position=make("geometry_msgs/msg/Point", x=x, y=y, z=z),
-                 orientation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw))
+    position = make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    orientation = make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw)
+    message = make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
     return make("nav_msgs/msg/Odometry", header=header, child_frame_id=moving_frame,
-                pose=make("geometry_msgs/msg/PoseWithCovariance", pose=place))
+                pose=make("geometry_msgs/msg/PoseWithCovariance", pose=message))
 
 
-def pose_of(pose: Any) -> np.ndarray:
-    """(4, 4) float64 of a geometry_msgs/Pose. InputError if it is not finite, or its quaternion is
-    no rotation."""
+def read_pose(pose: Any) -> np.ndarray:
+    """Return a geometry_msgs/Pose as matrix (4, 4) float64.
+
+    Raises InputError if it is not finite, or its quaternion is not of length 1.
+    """
     p, q = pose.position, pose.orientation
     return poses.pose_of(*poses.checked((p.x, p.y, p.z), (q.x, q.y, q.z, q.w), "a pose"))

@@ -1,4 +1,4 @@
-"""How the fields of a cloud are read."""
+"""Parameters for reading the fields of a cloud."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from lidar_perception.param_fields import Params, param
 
 @dataclass(frozen=True)
 class InputParams(Params):
-    """How to read the fields of a cloud."""
+    """How the fields of a cloud are read."""
 
     intensity_max: float = param(
         0.0, "The intensity of a full reflection: 1 for KITTI, 255 for Velodyne and nuScenes. 0: "
@@ -20,7 +20,7 @@ class InputParams(Params):
 
 @dataclass(frozen=True)
 class ViewParams(Params):
-    """Crop to the camera's field of view (paper A, Section 3.2)."""
+    """Crop of the cloud to the camera's field of view (paper A, Section 3.2)."""
 
     enabled: bool = param(
         False, "Keep only the points that the camera sees. Needs the camera's calibration: "

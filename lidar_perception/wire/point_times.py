@@ -1,4 +1,4 @@
-"""When each point of a cloud was measured, from the column of times that its driver gives it."""
+"""Measurement times of the points of a cloud, from the time column of its driver."""
 
 from __future__ import annotations
 
@@ -12,30 +12,40 @@ from lidar_perception.types import InputError, LidarFrame
 from msg_utils.point_cloud2 import CloudError, add_columns, to_array
 from msg_utils.stamps import SECOND, to_ns
 
-# As Ouster, Velodyne, Hesai and RoboSense, Autoware and Livox call it; the first that is there.
+# Names used by Ouster, Velodyne, Hesai and RoboSense, Autoware and Livox; the first match counts.
 NAMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
 UNITS_NS = (10**9, 10**6, 10**3, 1)
-LIVOX_COLUMN, LIVOX_UNIT_NS = ("offset_time", True), 1  # whole numbers: the unit is documented
-SWEEP = 2e-3, 1.0   # seconds that a turn takes: by these the unit is told from the others
-SINCE_1970_NS = 1e18  # later than 2001
-MAX_OFFSET = 1.0    # seconds between a point and the stamp of its cloud
+LIVOX_COLUMN, LIVOX_UNIT_NS = ("offset_time", True), 1  # integers: Livox documents the unit
+SWEEP_S = 2e-3, 1.0   # shortest and longest duration of a turn; this determines the unit
+SINCE_1970_NS = 1e18  # larger values count from 1970
+MAX_OFFSET_S = 1.0    # between a point and the stamp of its cloud
 
 
 class PointTimes(NamedTuple):
-    """name: of the column; seconds (N,) float64 after the stamp, NaN where the driver says so;
-    at_stamp: what the column says of a point that was measured at the stamp."""
+    """Measurement times of N points.
+
+    Attributes:
+        name: name of the column.
+        seconds: (N,) float64, relative to the stamp of the cloud; NaN where the driver wrote NaN.
+        at_stamp: value of the column for a point measured at the stamp.
+    """
 
     name: str
     seconds: np.ndarray
     at_stamp: int | float
 
 
-def point_times(msg: Any, indices: np.ndarray) -> PointTimes:
-    """Of the points (N,) of a PointCloud2 at indices (N,). Whether seconds, milli-, micro- or
-    nanoseconds is told by the span of the whole cloud, of which indices may be any part, and which
-    is taken for a turn; times that count from 1970 are taken from the stamp. Of other points 0 does
-    not count: drivers fill beams without a return so. InputError where there is no such column,
-    none of the points has a time, or they do not fit the stamp."""
+def read_point_times(msg: Any, indices: np.ndarray) -> PointTimes:
+    """Read the measurement times of the points (N,) of a PointCloud2 at indices (N,).
+
+    The unit (s, ms, us or ns) follows from the time span of the whole cloud, which is taken as one
+    turn of the sensor. Values that count from 1970 are converted to times relative to the stamp.
+    Zeros at points other than `indices` are ignored, as drivers write them for beams without
+    return.
+
+    Raises:
+        InputError: there is no such column, no point has a time, or the times do not fit the stamp.
+    """
     try:
         points = to_array(msg)
     except CloudError as error:
@@ -43,82 +53,96 @@ def point_times(msg: Any, indices: np.ndarray) -> PointTimes:
     names = points.dtype.names or ()
     name = next((n for n in NAMES if n in names), None)
     if name is None:
-        raise InputError(f"the cloud has no column of times ({', '.join(NAMES)}); it has "
-                         f"{', '.join(names) or 'none at all'}")
+        raise InputError(f"the cloud has no time column ({', '.join(NAMES)}); its columns are: "
+                         f"{', '.join(names) or 'none'}")
     if points.dtype[name].shape:
-        raise InputError(f"field '{name}' has count > 1; a single number is needed")
-    whole = points[name].dtype.kind in "iu"
-    column = points[name].astype(np.int64 if whole else np.float64)
+        raise InputError(f"field '{name}' has count > 1; it must have one number per point")
+    is_integer = points[name].dtype.kind in "iu"
+    column = points[name].astype(np.int64 if is_integer else np.float64)
     finite, values = np.isfinite(column), column.take(indices)
-    known = values[finite.take(indices)]
-    if not len(known):
-        raise InputError(f"no time in the column '{name}' is a number")
+    finite_values = values[finite.take(indices)]
+    if not len(finite_values):
+        raise InputError(f"all times in the column '{name}' are NaN or infinite")
     counts = column != 0
     counts[indices] = True
-    turn = column[counts & finite]
-    low, span = known.min(), turn.max() - turn.min()
-    unit = LIVOX_UNIT_NS if (name, whole) == LIVOX_COLUMN else _unit_ns(float(span), whole,
-                                                                        float(low))
+    turn_values = column[counts & finite]
+    low, span = finite_values.min(), turn_values.max() - turn_values.min()
+    unit = (LIVOX_UNIT_NS if (name, is_integer) == LIVOX_COLUMN
+            else _unit_ns(float(span), is_integer, float(low)))
     stamp = to_ns(msg.header.stamp)
     since_stamp = abs(float(low)) * unit <= abs(float(low) * unit - stamp)
-    at_stamp = 0 if since_stamp else stamp // unit if whole else stamp / unit
+    at_stamp = 0 if since_stamp else stamp // unit if is_integer else stamp / unit
     seconds = (values - at_stamp) * (unit * 1e-9)
-    off = max(float(np.nanmin(seconds)), float(np.nanmax(seconds)), key=abs)
-    if abs(off) > MAX_OFFSET:
-        raise InputError(f"the times in '{name}' are {off:.3f} s from header.stamp; do sensor and "
-                         "computer have the same clock?")
+    largest = max(float(np.nanmin(seconds)), float(np.nanmax(seconds)), key=abs)
+    if abs(largest) > MAX_OFFSET_S:
+        raise InputError(f"the times in '{name}' are {largest:.3f} s from header.stamp; are the "
+                         "clocks of sensor and computer synchronised?")
     return PointTimes(name, seconds, at_stamp)
 
 
-def _unit_ns(span: float, whole: bool, low: float) -> int:
-    """Nanoseconds of the unit of times from low on, of a cloud that spans a turn."""
+def _unit_ns(span: float, is_integer: bool, low: float) -> int:
+    """Return the time unit in ns, from the span of the times of one turn and the least of them."""
     since_1970 = next((unit for unit in reversed(UNITS_NS) if low * unit > SINCE_1970_NS), None)
     if since_1970 is not None:
         return since_1970
-    for unit in UNITS_NS[2:] if whole else UNITS_NS:  # whole seconds would tell nothing
-        if SWEEP[0] <= span * unit * 1e-9 <= SWEEP[1]:
+    for unit in UNITS_NS[2:] if is_integer else UNITS_NS:  # s and ms are too coarse as integers
+        if SWEEP_S[0] <= span * unit * 1e-9 <= SWEEP_S[1]:
             return unit
-    return 1 if whole else 10**9  # a cloud of less than SWEEP, or one moment
+    return 1 if is_integer else 10**9  # a cloud shorter than SWEEP_S
 
 
-def corrected(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: Poses
-              ) -> tuple[np.ndarray, np.ndarray, PointTimes] | None:
-    """Of the N points of a frame, which are those of a PointCloud2 at indices (N,): which of them
-    (M,) have a time, these (M, 3) moved to the stamp, and their times; None where all times are
-    those of the stamp already, and of no points. poses: of the sensor (K, 4, 4), in any frame that
-    does not move, at times (K,) ns."""
+def deskew_points(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: Poses
+                  ) -> tuple[np.ndarray, np.ndarray, PointTimes] | None:
+    """Move the points of a frame to where they are seen from the sensor's pose at the stamp.
+
+    Args:
+        msg: PointCloud2 with a time column.
+        frame: N of its points.
+        indices: (N,) indices of these points in `msg`.
+        poses: returns the poses (K, 4, 4) of the sensor in a fixed frame at times (K,) ns.
+
+    Returns:
+        indices (M,) into `frame` of the points that have a time, their moved coordinates (M, 3),
+        and their times. None if the frame is empty or all points were measured at the stamp.
+    """
     if not len(indices):
         return None
-    times = point_times(msg, indices)
+    times = read_point_times(msg, indices)
     if not times.seconds.any():
         return None
-    known, xyz = np.flatnonzero(np.isfinite(times.seconds)), frame.xyz
-    if len(known) < len(frame):
-        times = times._replace(seconds=times.seconds.take(known))
-        xyz = xyz.take(known, axis=0)
-    moved = deskewed(xyz, times.seconds, lambda at: poses(
-        frame.stamp_ns + np.rint(at * SECOND).astype(np.int64)))
-    return known, moved, times
+    timed, xyz = np.flatnonzero(np.isfinite(times.seconds)), frame.xyz
+    if len(timed) < len(frame):
+        times = times._replace(seconds=times.seconds.take(timed))
+        xyz = xyz.take(timed, axis=0)
+    moved = deskewed(xyz, times.seconds, lambda seconds: poses(
+        frame.stamp_ns + np.rint(seconds * SECOND).astype(np.int64)))
+    return timed, moved, times
 
 
-def moved_to_stamp(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: Poses) -> LidarFrame:
-    """The frame with its points moved to its stamp, see corrected(); those without a time stay."""
-    if (found := corrected(msg, frame, indices, poses)) is None:
+def deskew_frame(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: Poses) -> LidarFrame:
+    """Return the frame with its points moved to its stamp, see deskew_points.
+
+    Points without a time stay where they are.
+    """
+    if (deskewed_points := deskew_points(msg, frame, indices, poses)) is None:
         return frame
+    timed, moved, _ = deskewed_points
     xyz = frame.xyz.copy()
-    xyz[found[0]] = found[1]
+    xyz[timed] = moved
     return replace(frame, xyz=xyz)
 
 
-def moved_cloud(msg: Any, make: Any, indices: np.ndarray, moved: np.ndarray,
-                times: PointTimes) -> Any:
-    """The cloud with the points at indices (N,) moved to (N, 3), and all times at its stamp, so
-    that who corrects it again changes nothing."""
+def replace_points(msg: Any, make: Any, indices: np.ndarray, moved: np.ndarray,
+                   times: PointTimes) -> Any:
+    """Return the cloud with the points at indices (N,) replaced by moved (N, 3).
+
+    All times are set to the stamp, so that a second motion correction changes nothing.
+    """
     points = to_array(msg)
-    new = {}
+    columns = {}
     for axis, name in enumerate("xyz"):
-        new[name] = points[name].astype(points[name].dtype.newbyteorder("="))
-        new[name][indices] = moved[:, axis]
+        columns[name] = points[name].astype(points[name].dtype.newbyteorder("="))
+        columns[name][indices] = moved[:, axis]
     kind = points[times.name].dtype.newbyteorder("=")
-    new[times.name] = np.full(len(points), times.at_stamp, kind)
-    return add_columns(msg, make, **new)
+    columns[times.name] = np.full(len(points), times.at_stamp, kind)
+    return add_columns(msg, make, **columns)

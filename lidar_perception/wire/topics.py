@@ -2,14 +2,14 @@
 
 POINTS = "/points"
 TRUTH = "/ground_truth/detections"
-TRUTH_3D = "/ground_truth/detections_3d"  # the same as Detection3DArray, where it is asked for
+TRUTH_3D = "/ground_truth/detections_3d"  # the same as Detection3DArray, optional
 CAMERA_INFO = "/camera/camera_info"
 EXTRINSICS = "/camera/extrinsics"  # geometry_msgs/TransformStamped, camera in the LiDAR frame
 IMAGE = "/camera/image/compressed"
 TF, TF_STATIC = "/tf", "/tf_static"
-ODOMETRY = "/odom"                 # nav_msgs/Odometry, as drivers and navigation name it
+ODOMETRY = "/odom"                 # nav_msgs/Odometry, the usual name
 CLICK = "/clicked_point"           # what RViz and Foxglove publish
-FOUND, TRACKS = "/output/detections", "/output/tracks"  # at the end of a node's topic
+FOUND, TRACKS = "/output/detections", "/output/tracks"  # suffixes of the topics of a node
 
 ODOMETRY_FRAME = "odom"            # fixed; REP-105
 LIDAR_FRAME = "velodyne"

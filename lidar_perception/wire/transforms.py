@@ -1,4 +1,4 @@
-"""TF and odometry in a tree of frames."""
+"""TF and odometry messages added to a transform tree."""
 
 from __future__ import annotations
 
@@ -9,28 +9,32 @@ from lidar_perception.types import InputError
 from msg_utils.stamps import to_ns
 
 TF_MESSAGE, ODOMETRY_MESSAGE = "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry"
-# The frames of the odometry, by the fields of the message and not by what these hold: both may hold
-# the same, or nothing.
-MOVING, STILL = "child_frame_id", "header.frame_id"
+# Frame names in the tree of an odometry: the fields of the message instead of their contents, which
+# may be equal or empty.
+MOVING, FIXED = "child_frame_id", "header.frame_id"
 
 
 def add_transforms(tree: TransformTree, msg: Any, static: bool) -> None:
-    """Add those of a tf2_msgs/TFMessage to a tree. InputError at the end where one of them is no
-    transform, which is left out."""
-    wrong = None
-    for each in msg.transforms:
-        t, q = each.transform.translation, each.transform.rotation
+    """Add the transforms of a tf2_msgs/TFMessage to a tree.
+
+    Raises InputError after all valid ones were added if one of them is invalid.
+    """
+    problem = None
+    for stamped in msg.transforms:
+        t, q = stamped.transform.translation, stamped.transform.rotation
         try:
-            tree.set(each.header.frame_id, each.child_frame_id, to_ns(each.header.stamp),
+            tree.set(stamped.header.frame_id, stamped.child_frame_id, to_ns(stamped.header.stamp),
                      (t.x, t.y, t.z), (q.x, q.y, q.z, q.w), static)
         except InputError as error:
-            wrong = error
-    if wrong is not None:
-        raise wrong
+            problem = error
+    if problem is not None:
+        raise problem
 
 
 def add_odometry(tree: TransformTree, msg: Any) -> None:
-    """Add a nav_msgs/Odometry to a tree of its own: where MOVING is in STILL at its stamp.
-    InputError where it is no pose."""
+    """Add a nav_msgs/Odometry to a separate tree: the pose of MOVING in FIXED at its stamp.
+
+    Raises InputError if the pose is invalid.
+    """
     p, q = msg.pose.pose.position, msg.pose.pose.orientation
-    tree.set(STILL, MOVING, to_ns(msg.header.stamp), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+    tree.set(FIXED, MOVING, to_ns(msg.header.stamp), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))

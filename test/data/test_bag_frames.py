@@ -19,7 +19,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import points_of, write_bag
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import truth_markers
+from lidar_perception.wire.messages import make_truth_markers
 from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
 from msg_utils.point_cloud2 import from_array
 
@@ -140,7 +140,7 @@ def test_stamps_of_0_count_unless_all_are_0(tmp_path, stamps, expected):
         for i, stamp in enumerate(stamps):
             head = header(bag_message, stamp)
             bag.write(POINTS, 70 + i, from_array(points_of(scans(1)[0].load()), head, bag_message))
-            bag.write(TRUTH, 70 + i, truth_markers(walker_truth(), head, bag_message))
+            bag.write(TRUTH, 70 + i, make_truth_markers(walker_truth(), head, bag_message))
     recording = open_recording(tmp_path / "bag")
     assert [frame.stamp_ns for frame in recording] == expected
     assert [frame.stamp_ns for frame in recording.frames[:]] == expected

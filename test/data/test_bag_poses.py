@@ -26,7 +26,7 @@ from lidar_perception.robot.placing import tilted
 from lidar_perception.robot.poses import inverse
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import odometry
+from lidar_perception.wire.messages import make_odometry
 from lidar_perception.wire.topics import ODOMETRY, TF, TF_STATIC
 from lidar_perception.wire.transforms import ODOMETRY_MESSAGE, TF_MESSAGE
 from msg_utils.stamps import SECOND, header_message
@@ -99,7 +99,7 @@ def test_what_says_nothing_gives_no_pose_and_nothing_is_guessed(tmp_path):
     two = recorded(tmp_path / "two", moving("/left"), moving("/right"))
     assert POSES not in two.has
     short = recorded(tmp_path / "short", moving(ODOMETRY, "lidar", seconds=-1),
-                     [(ODOMETRY, ODOMETRY_MESSAGE, START - SECOND, odometry(
+                     [(ODOMETRY, ODOMETRY_MESSAGE, START - SECOND, make_odometry(
                          base_at(START), header_message(START - SECOND, "odom", bag_message),
                          "lidar", bag_message))])
     assert [frame.pose() for frame in short] == [None] * CLOUDS  # it ended a second before

@@ -25,7 +25,7 @@ from lidar_perception.testing.bags import copy_bag
 from lidar_perception.types import InputError, InputWarning
 from lidar_perception.wire.clouds import COMPRESSED, LIVOX
 from lidar_perception.wire.codec import bag_message, encode
-from lidar_perception.wire.point_times import point_times
+from lidar_perception.wire.point_times import read_point_times
 from lidar_perception.wire.topics import EXTRINSICS, POINTS
 
 STATE = "my_robot_msgs/msg/State"
@@ -416,7 +416,7 @@ def test_livox_bags_open_with_intensity_and_times_of_points(tmp_path, kind, ros)
     np.testing.assert_array_equal(frame.xyz, np.column_stack([points[axis] for axis in "xyz"]))
     np.testing.assert_allclose(frame.intensity, points["reflectivity"] / 255, atol=1e-6)
     clouds = open_clouds(path)
-    times = point_times(clouds.load(1), np.arange(50)).seconds
+    times = read_point_times(clouds.load(1), np.arange(50)).seconds
     np.testing.assert_allclose(times, points["offset_time"] * 1e-9, atol=1e-12)
     write_bag(tmp_path / "converted", recording)
     assert np.array_equal(open_recording(tmp_path / "converted").frames[2].load().xyz, frame.xyz)
@@ -432,8 +432,8 @@ def test_compressed_clouds_of_a_bag_are_read(tmp_path, packing):
 
 
 @pytest.mark.parametrize("kind, words", [
-    (COMPRESSED, "clouds compressed by draco are not read"),
-    ("sensor_msgs/msg/LaserScan", "LaserScan on /scan is not read"),
+    (COMPRESSED, "compression .draco. is not supported"),
+    ("sensor_msgs/msg/LaserScan", "LaserScan on /scan cannot be read"),
     ("velodyne_msgs/msg/VelodyneScan", "VelodyneScan on /scan .*play the bag to velodyne")])
 @pytest.mark.parametrize("points", ["", "/scan"])
 def test_a_bag_with_other_data_of_a_sensor_says_what_to_do(tmp_path, kind, words, points):

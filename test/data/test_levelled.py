@@ -115,7 +115,7 @@ def test_a_bags_clouds_are_moved_to_their_stamps(moves, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("parts, cloud, words", [
-    ([moving(ODOMETRY), mount()], point, "no column of times"),
+    ([moving(ODOMETRY), mount()], point, "no time column"),
     ([], in_motion, "neither odometry nor a TF"),
 ], ids=["no times", "no poses"])
 def test_what_deskewing_lacks_is_said(parts, cloud, words, tmp_path, monkeypatch, capsys):

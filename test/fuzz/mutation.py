@@ -13,7 +13,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from fuzz.case import pick
-from lidar_perception.wire.codec import bag_message, typestore
+from lidar_perception.wire.codec import bag_message, load_typestore
 
 INTEGERS = (0, 1, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
 FLOATS = (0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 1e-40, 1e38, -1e38, 1e308, 1e5, -1.0)
@@ -94,7 +94,7 @@ def mutate_text(text: str, rng: np.random.Generator) -> tuple[str, str]:
 def mutate_message(message: Any, rng: np.random.Generator) -> str:
     """Give one field of a message, at any depth, another value of its type. message: of rosbags'
     classes, changed in place."""
-    name, kind = pick(rng, [field for field in typestore().fielddefs[message.__msgtype__][1]])
+    name, kind = pick(rng, [field for field in load_typestore().fielddefs[message.__msgtype__][1]])
     (node, detail), value = kind, getattr(message, name)
     if node == Nodetype.NAME:
         return f"{name}.{mutate_message(value, rng)}"

@@ -12,7 +12,7 @@ from fuzz.mutation import FLOATS, INTEGERS, mutate_message
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import PEDESTRIAN, SENSOR_HEIGHT, GroundTruth
 from lidar_perception.wire.codec import bag_message, decode, encode
-from lidar_perception.wire.messages import camera_info, extrinsics, truth_markers
+from lidar_perception.wire.messages import make_camera_info, make_extrinsics, make_truth_markers
 from msg_utils.point_cloud2 import CloudError, add_columns, from_array, to_array
 from msg_utils.stamps import header_message
 
@@ -73,12 +73,12 @@ def valid_message(kind: str) -> bytes:
         return encode(cloud())
     if kind == "visualization_msgs/msg/MarkerArray":
         truth = GroundTruth.of([PERSON], [PEDESTRIAN], [{"track_id": 3}])
-        return encode(truth_markers(truth, header(), bag_message))
+        return encode(make_truth_markers(truth, header(), bag_message))
     if kind == "sensor_msgs/msg/CameraInfo":
-        return encode(camera_info(FORWARD_CAMERA, header_message(STAMP, "camera_optical",
-                                                                 bag_message), bag_message))
+        return encode(make_camera_info(FORWARD_CAMERA, header_message(STAMP, "camera_optical",
+                                                                      bag_message), bag_message))
     if kind == "geometry_msgs/msg/TransformStamped":
-        return encode(extrinsics(FORWARD_CAMERA, header(), bag_message))
+        return encode(make_extrinsics(FORWARD_CAMERA, header(), bag_message))
     if kind == "geometry_msgs/msg/PointStamped":
         x, y, z = map(float, PERSON[:3])
         return encode(bag_message(kind, header=header(), point=bag_message(

@@ -28,7 +28,7 @@ from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.types import SENSOR_HEIGHT, Detections, GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import detection_markers
+from lidar_perception.wire.messages import make_detection_markers
 from lidar_perception.wire.topics import ODOMETRY, POINTS
 from lidar_studio import results
 from msg_utils.detections import to_detection_array
@@ -204,7 +204,7 @@ def test_detections_on_a_topic_become_labels(tmp_path, monkeypatch):
         for i, frame in enumerate(frames):
             found = Detections.of(rng.uniform(1, 9, (i, 7)) / [1, 1, 1, 1, 1, 1, 3], 0, 0.5)
             header = header_message(frame.stamp_ns, "velodyne", bag_message)
-            bag.write("/found", frame.stamp_ns, detection_markers(found, header, bag_message))
+            bag.write("/found", frame.stamp_ns, make_detection_markers(found, header, bag_message))
             bag.write("/tracks", frame.stamp_ns, to_detection_array(
                 found.boxes, ["tree"] * i, found.scores.tolist(), header=header, make=bag_message,
                 ids=[100 + k for k in range(i)]))

@@ -12,7 +12,7 @@ from samples import STAMP, each_make, header
 
 from lidar_perception.types import CLASSES, GroundTruth
 from lidar_perception.wire import codec
-from lidar_perception.wire.messages import to_detections, to_truth, truth_markers
+from lidar_perception.wire.messages import make_truth_markers, to_detections, to_truth
 from msg_utils.detections import from_detection_array, to_detection_array
 from msg_utils.markers import (
     ADD,
@@ -175,7 +175,7 @@ def test_labels_keep_their_track_where_it_tells_them_apart(make, tracks, ids):
     extras = [{} if t is None else {"track_id": t} for t in tracks]
     truth = GroundTruth.of(np.ones((len(tracks), 7)), [0] * len(tracks), extras,
                            [("DontCare", {"track_id": -1})])
-    got = from_marker_array(truth_markers(truth, header(make), make))
+    got = from_marker_array(make_truth_markers(truth, header(make), make))
     assert got.ids.tolist() == ids
     assert to_truth(got).extras == truth.extras and to_truth(got).notes == truth.notes
 

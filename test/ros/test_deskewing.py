@@ -12,7 +12,7 @@ from test_robot_frames import PERIOD, START, give, message, mounted, odometry, p
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.robot.deskew import skewed, steady
 from lidar_perception.wire.codec import bag_message, decode, encode
-from lidar_perception.wire.messages import column, to_frame
+from lidar_perception.wire.messages import read_column, to_frame
 from msg_utils.point_cloud2 import to_array
 from msg_utils.stamps import time_message
 
@@ -66,7 +66,7 @@ def test_a_cloud_of_a_moving_sensor_is_moved_to_its_stamp(start, source):
     np.testing.assert_allclose(moved[others], still[others], atol=5e-3)
     assert np.median(wrong) > 0.5
     np.testing.assert_array_equal(moved[body], still[body])
-    assert not column(after, "in_view", body).any() and not to_array(after)["t"].any()
+    assert not read_column(after, "in_view", body).any() and not to_array(after)["t"].any()
     frame_, _ = to_frame(after)
     again = start(GroundSegmentation, **{"input.deskew": source})
     again.transforms = node.transforms
@@ -75,7 +75,7 @@ def test_a_cloud_of_a_moving_sensor_is_moved_to_its_stamp(start, source):
         to_array(decode(again.sent["points"][-1], "sensor_msgs/msg/PointCloud2"))["x"],
         moved[:, 0])
     give(node, message(raw, START + PERIOD))
-    assert "no column of times" in problems(node) and len(node.sent["points"]) == 3
+    assert "no time column" in problems(node) and len(node.sent["points"]) == 3
     assert time_message(START, bag_message).sec == after.header.stamp.sec and len(frame_)
 
 

@@ -25,7 +25,7 @@ from lidar_perception.tracking.ego import has_odometry
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.codec import bag_message, decode, encode
-from lidar_perception.wire.messages import any_class_ids, detection_markers
+from lidar_perception.wire.messages import make_detection_markers, to_class_ids
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import header_message
 
@@ -52,7 +52,7 @@ def drive(node, tell, poses, frame_id="lidar"):
         stamp = START + i * TENTH
         tell(i, stamp)
         seen = Detections.of(moved_boxes(found.boxes, inverse(at)), found.class_ids, found.scores)
-        node.on_markers(detection_markers(seen, header(stamp, frame_id), bag_message))
+        node.on_markers(make_detection_markers(seen, header(stamp, frame_id), bag_message))
         tracks, shown = library(seen, stamp, at), tracked(node)
         assert shown.ids.tolist() == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
         np.testing.assert_allclose(shown.boxes, tracks.detections.boxes, atol=1e-4)
@@ -91,13 +91,13 @@ def test_without_a_way_from_the_odometry_to_the_sensor_they_are_in_one_place_and
     stamp = START + 10 * TENTH
     node.transforms.on_odometry(odometry(base_at(10), stamp))
     found = next(crowd())
-    node.on_markers(detection_markers(found, header(stamp), bag_message))
+    node.on_markers(make_detection_markers(found, header(stamp), bag_message))
     assert min(tracked(node).ids) > 6  # the poses are others from here on: all tracks ended
 
 
 def test_what_tf_lacks_is_named(start):
     node = start(TrackerNode, **{"ego.source": "tf", "input.fixed_frame": "map"})
-    node.on_markers(detection_markers(next(crowd()), header(START), bag_message))
+    node.on_markers(make_detection_markers(next(crowd()), header(START), bag_message))
     assert "TF does not connect 'lidar' with 'map'" in node.state[1]
 
 
@@ -114,8 +114,8 @@ def test_auto_takes_the_scans_after_a_second_without_poses_and_what_is_better_wh
         for i in range(first, first + count):
             if len(node._receptions()) > node_inputs:
                 give_to_points(message(xyz, START + i * TENTH))
-            found.deliver(encode(detection_markers(next(crowd()), header(START + i * TENTH),
-                                                   bag_message)), False)
+            found.deliver(encode(make_detection_markers(next(crowd()), header(START + i * TENTH),
+                                                        bag_message)), False)
 
     def give_to_points(cloud):
         points = next(r for r in node._receptions() if r.topic.endswith("/points"))
@@ -193,7 +193,7 @@ def test_odometry_of_another_clock_and_one_that_has_stopped_are_named(start, mon
 
     def said(seconds):
         stamp = header(START + round(seconds * 10 * TENTH))
-        found.deliver(encode(detection_markers(next(crowd()), stamp, bag_message)), False)
+        found.deliver(encode(make_detection_markers(next(crowd()), stamp, bag_message)), False)
         return node.state[1]
 
     node.transforms.on_odometry(odometry(base_at(0), START + 1000 * 10 * TENTH, "lidar"))
@@ -215,7 +215,7 @@ def test_a_source_that_is_always_too_late_is_named(start, source, lag):
             node.transforms.on_odometry(odometry(base_at(i), past, "lidar"))
         else:
             node.transforms.on_tf(transforms(("odom", "lidar", base_at(i), past)), static=False)
-        node.on_markers(detection_markers(next(crowd()), header(stamp), bag_message))
+        node.on_markers(make_detection_markers(next(crowd()), header(stamp), bag_message))
         assert f"{lag:.3f} s older than needed" in node.state[1]
     assert node.counts["ego"] == source
 
@@ -270,14 +270,14 @@ def test_poses_of_the_scans_are_carried_to_the_frame_of_the_detections(start):
 
 def test_classes_of_other_stacks_are_known_and_those_that_are_not_are_named(start):
     found = next(crowd())
-    there = detection_markers(found, header(START), bag_message)
+    there = make_detection_markers(found, header(START), bag_message)
     for marker in there.markers:
         marker.ns = {"Pedestrian": "person", "Car": "car", "Cyclist": "BICYCLE"}.get(marker.ns,
                                                                                      marker.ns)
     node = start(TrackerNode)
     node.on_markers(there)
     assert node.state[1] == "tracking"
-    assert any_class_ids(["person", "CAR", "bicycle", "tree"]) == [
+    assert to_class_ids(["person", "CAR", "bicycle", "tree"]) == [
         PEDESTRIAN, CAR, CYCLIST, CLASSES.index("Misc")]
     there.markers[-1].ns = "sofa"
     node.on_markers(there)

@@ -14,13 +14,13 @@ from tracking_samples import START, TENTH, crowd
 from lidar_perception.nodes.evaluator import WAITING_FRAMES, Evaluator
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import detection_markers
+from lidar_perception.wire.messages import make_detection_markers
 from msg_utils.stamps import header_message
 
 
 def array(number, frame_id="lidar"):
-    return detection_markers(next(crowd()), header_message(START + number * TENTH, frame_id,
-                                                           bag_message), bag_message)
+    return make_detection_markers(next(crowd()), header_message(START + number * TENTH, frame_id,
+                                                                bag_message), bag_message)
 
 
 def said(node):

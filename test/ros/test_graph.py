@@ -23,7 +23,7 @@ from lidar_perception.scoring.centres.report import (
     seed_source,
 )
 from lidar_perception.testing.processes import NodesUnderTest
-from lidar_perception.wire.messages import column, to_detections, to_frame
+from lidar_perception.wire.messages import read_column, to_detections, to_frame
 from lidar_perception.wire.topics import POINTS
 from msg_utils.markers import from_marker_array
 from msg_utils.point_cloud2 import to_array
@@ -104,8 +104,9 @@ def test_the_published_cloud_holds_all_fields_and_the_offline_columns(run, offli
             np.testing.assert_array_equal(to_array(msg)[name], original[name])
         segmented, _ = offline[0][frame.stamp_ns]
         np.testing.assert_array_equal(indices, segmented.indices)
-        np.testing.assert_array_equal(column(msg, "ground", indices) > 0, segmented.ground)
-        np.testing.assert_array_equal(column(msg, "cluster_id", indices), segmented.cluster_ids)
+        np.testing.assert_array_equal(read_column(msg, "ground", indices) > 0, segmented.ground)
+        np.testing.assert_array_equal(read_column(msg, "cluster_id", indices),
+                                      segmented.cluster_ids)
         assert msg.header.frame_id == "velodyne"
 
 

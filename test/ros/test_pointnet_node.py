@@ -26,7 +26,7 @@ from lidar_perception.detectors.pointnet.params import STEPS
 from lidar_perception.nodes.graph import POINTNET
 from lidar_perception.nodes.main import run
 from lidar_perception.param_fields import with_values
-from lidar_perception.wire.messages import column, to_frame
+from lidar_perception.wire.messages import read_column, to_frame
 from lidar_perception.wire.topics import POINTS
 
 NODE = "pointnet_detector"
@@ -63,7 +63,7 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
     segmented = segment_cloud(scan, None, with_values(PipelineParams(),
                                                       read_config(SHARED, PipelineParams())))
     assert segmented.ground.any() and segmented.cluster_ids.max() >= 5
-    np.testing.assert_array_equal(column(points[-1], "cluster_id", np.arange(len(scan))),
+    np.testing.assert_array_equal(read_column(points[-1], "cluster_id", np.arange(len(scan))),
                                   segmented.cluster_ids)
     expected = offline(weights, message(1), cluster_ids=segmented.cluster_ids)
     assert_equal(received(found, 1), expected)

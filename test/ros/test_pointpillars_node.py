@@ -24,7 +24,7 @@ from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.nodes.graph import POINTPILLARS
 from lidar_perception.nodes.main import run
 from lidar_perception.param_fields import with_values
-from lidar_perception.wire.messages import column, to_frame
+from lidar_perception.wire.messages import read_column, to_frame
 from lidar_perception.wire.topics import POINTS
 
 NODE = "pointpillars_detector"
@@ -61,8 +61,8 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
     columns = {"ground": segmented.ground, "cluster_ids": segmented.cluster_ids}
     assert segmented.ground.any() and segmented.cluster_ids.max() >= 2
     marked, indices = points[-1], np.arange(len(scan))
-    np.testing.assert_array_equal(column(marked, "ground", indices) > 0, segmented.ground)
-    np.testing.assert_array_equal(column(marked, "cluster_id", indices), segmented.cluster_ids)
+    np.testing.assert_array_equal(read_column(marked, "ground", indices) > 0, segmented.ground)
+    np.testing.assert_array_equal(read_column(marked, "cluster_id", indices), segmented.cluster_ids)
     assert_equal(received(found, 1), offline(weights, message(1), **columns))
     assert received(found, 1).frame_id == "lidar"
 

@@ -17,7 +17,7 @@ from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.transforms import STATIC_QOS
 from lidar_perception.param_fields import with_values
 from lidar_perception.wire.codec import bag_message, encode
-from lidar_perception.wire.messages import column, to_detections, to_frame
+from lidar_perception.wire.messages import read_column, to_detections, to_frame
 from lidar_perception.wire.topics import POINTS
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import header_message
@@ -51,14 +51,14 @@ def test_a_cropped_cloud_over_dds_is_the_cropped_frame_offline(processes, peer, 
     np.testing.assert_array_equal(received.boxes, expected.boxes)
     np.testing.assert_array_equal(received.scores, expected.scores)
     everything = np.arange(cloud.height * cloud.width)
-    in_view = np.flatnonzero(column(clouds[-1], "in_view", everything))
+    in_view = np.flatnonzero(read_column(clouds[-1], "in_view", everything))
     np.testing.assert_array_equal(in_view, usable.take(segmented.indices))
-    np.testing.assert_array_equal(column(clouds[-1], "ground", in_view) > 0, segmented.ground)
+    np.testing.assert_array_equal(read_column(clouds[-1], "ground", in_view) > 0, segmented.ground)
     cropped = str(len(frame) - len(segmented.indices))
     peer.wait(lambda: peer.value_of("perception", "cropped") == cropped, "the count")
 
     peer.set_parameter("/ground_segmentation", "crop.sectors", [0, 360])
-    peer.send(talker, cloud, lambda: not column(clouds[-1], "in_view", everything).any(),
+    peer.send(talker, cloud, lambda: not read_column(clouds[-1], "in_view", everything).any(),
               "a cloud of which nothing is left")
     peer.wait(lambda: "crop.* leaves none" in peer.message_of("ground_segmentation"), "the reason")
 

@@ -25,9 +25,9 @@ from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
 from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.messages import (
-    detection_markers,
-    odometry,
-    pose_of,
+    make_detection_markers,
+    make_odometry,
+    read_pose,
     to_detections,
     to_truth,
 )
@@ -50,7 +50,7 @@ def header(stamp, frame_id="lidar"):
 def poses_of(path):
     """By stamp."""
     with Bag(path) as bag:
-        return {to_ns(m.header.stamp): pose_of(m.pose.pose)
+        return {to_ns(m.header.stamp): read_pose(m.pose.pose)
                 for _, _, m in bag.messages({ODOMETRY})}
 
 
@@ -170,13 +170,13 @@ def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes,
     def frame(found, frame_id="lidar"):
         nonlocal now
         now += TENTH
-        return detection_markers(found, header(now, frame_id), bag_message)
+        return make_detection_markers(found, header(now, frame_id), bag_message)
 
     def move(poses, child="lidar"):
         """Poses of the next frames. Those of another child count when the first are silent."""
         for i, at in enumerate(poses):
             stamp = now + (i + 1) * TENTH
-            message = odometry(at, header(stamp, "odom"), child, bag_message)
+            message = make_odometry(at, header(stamp, "odom"), child, bag_message)
             moving.publish(encode(message))
         peer.send(moving, message, lambda: peer.value_of(NODE, "last_pose_ns") == str(stamp),
                   "the poses")
@@ -185,7 +185,7 @@ def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes,
     for _ in range(3):
         assert read(send(frame(found)))[1] == [1]
     for late, words in (0, "has the stamp of the one before"), (3, "older than the last one"):
-        old = detection_markers(found, header(now - late * TENTH), bag_message)
+        old = make_detection_markers(found, header(now - late * TENTH), bag_message)
         send(old, words, answered=False)
     send(bag_message(MARKERS), "an array without a marker", answered=False)
     now += TENTH
@@ -203,7 +203,7 @@ def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes,
         last = send(frame(cars(person(30), kind=[PEDESTRIAN, CYCLIST][i % 2])))
     assert len({*read(last)[1]} - {*before}) == 1
 
-    assert read(send(detection_markers(found, header(0), bag_message), "no stamps"))[0] == 0
+    assert read(send(make_detection_markers(found, header(0), bag_message), "no stamps"))[0] == 0
     move([pose(0.8 * i) for i in range(12)])
     send(frame(found), "poses began")
     for i in range(1, 12):
@@ -222,8 +222,8 @@ def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes,
 def test_detection_arrays_are_tracked_as_markers_are(start):
     """By the node in this process, as vision_msgs is not everywhere."""
     node, tracker = start(TrackerNode), Tracker()
-    node.transforms.on_odometry(odometry(pose(50, 0, 1), header(START, "lidar"), "base",
-                                          bag_message))  # detections are in its fixed frame
+    node.transforms.on_odometry(make_odometry(pose(50, 0, 1), header(START, "lidar"), "base",
+                                               bag_message))  # detections are in its fixed frame
     for i, found in enumerate(crowd()):
         stamp = START + i * TENTH
         node.on_detections(to_detection_array(

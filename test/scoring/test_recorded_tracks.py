@@ -15,9 +15,9 @@ from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import GroundTruth
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import truth_markers
+from lidar_perception.wire.messages import make_truth_markers
 from lidar_perception.wire.topics import TRUTH
-from lidar_perception.wire.track_markers import drawn_trails, track_markers
+from lidar_perception.wire.track_markers import make_track_markers, read_trails
 from msg_utils.stamps import header_message
 
 MARKERS, TRACKS = "visualization_msgs/msg/MarkerArray", "/tracker/output/tracks"
@@ -37,10 +37,10 @@ def recorded(request, tmp_path):
             extras = [{"track_id": k, "occluded": 0, "truncated": 0.0} if request.param else {}
                       for k in range(len(found))]
             truth = GroundTruth.of(found.boxes, found.class_ids, extras)
-            message = track_markers(tracks.ids, tracks.detections, tracks.velocities,
-                                    tracks.moving, trails(tracks, tracker.pose, stamp, 1.0),
-                                    header, bag_message)
-            bag.write(TRUTH, stamp, truth_markers(truth, header, bag_message))
+            message = make_track_markers(tracks.ids, tracks.detections, tracks.velocities,
+                                         tracks.moving, trails(tracks, tracker.pose, stamp, 1.0),
+                                         header, bag_message)
+            bag.write(TRUTH, stamp, make_truth_markers(truth, header, bag_message))
             bag.write(TRACKS, stamp, message)
     return tmp_path / "bag", request.param, message
 
@@ -64,5 +64,5 @@ def test_recorded_tracks_are_counted_and_scored_where_labels_have_ids(recorded):
 
 
 def test_the_recorded_tracks_have_their_trails(recorded):
-    trails = drawn_trails(recorded[2])
+    trails = read_trails(recorded[2])
     assert {*trails} == {1, 2, 3, 4, 5, 6} and all(len(way) > 5 for way in trails.values())

@@ -14,7 +14,7 @@ from lidar_perception.robot.poses import moved_boxes, moved_points, pose_of
 from lidar_perception.types import Detections, InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.topics import TRUTH
-from lidar_perception.wire.track_markers import track_markers
+from lidar_perception.wire.track_markers import make_track_markers
 from lidar_studio import live as rooms
 from lidar_studio.live import BOXES, LABELS, TRACKS, Live
 from lidar_studio.live_topics import box_topics, clouds_topic
@@ -158,9 +158,9 @@ def test_boxes_in_another_frame_are_those_of_the_clouds_once_tf_has_come(live, m
         live.cloud(cloud(stamp))
         pose = pose_of(np.array([4.0 * i / 2, 0, 0]), [0, 0, 0, 1]) @ pose_of(mounted, turned)
         found = Detections.of(moved_boxes(boxes(stamp).boxes, pose), [0], [0.5])
-        tracks = track_markers(np.array([3]), found, np.zeros((1, 2)), np.zeros(1),
-                               [moved_points(trail, pose)],
-                               header_message(stamp, "odom", bag_message), bag_message)
+        tracks = make_track_markers(np.array([3]), found, np.zeros((1, 2)), np.zeros(1),
+                                    [moved_points(trail, pose)],
+                                    header_message(stamp, "odom", bag_message), bag_message)
         live.boxes(TRACKED, from_marker_array(tracks), tracks)
         if i:
             live.boxes(FOUND, boxes(stamp), None)

@@ -17,7 +17,7 @@ from lidar_perception.testing.detections import assert_detections, objects_of
 from lidar_perception.testing.launching import description, launch_file
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import detection_markers, to_frame, truth_markers
+from lidar_perception.wire.messages import make_detection_markers, make_truth_markers, to_frame
 from msg_utils.detections import to_detection_array
 from msg_utils.point_cloud2 import to_array
 
@@ -40,8 +40,8 @@ def test_every_kind_of_detections_says_the_same(make):
     found = some(np.random.default_rng(0), 7)
     expected = objects_of(found)
     truth = GroundTruth.of(found.boxes, found.class_ids)
-    kinds = [detection_markers(found, header(make), make), truth_markers(truth, header(make), make),
-             truth, expected, pairs_of(expected)]
+    kinds = [make_detection_markers(found, header(make), make),
+             make_truth_markers(truth, header(make), make), truth, expected, pairs_of(expected)]
     if make is not bag_message and importlib.util.find_spec("vision_msgs"):
         kinds.append(to_detection_array(found.boxes, expected.labels, found.scores,
                                         header=header(make), make=make))

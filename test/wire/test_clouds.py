@@ -1,4 +1,4 @@
-"""Every message that holds a cloud becomes the same PointCloud2."""
+"""Conversion of every kind of cloud message to PointCloud2."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from samples import STAMP
 
 from lidar_perception.types import InputError
-from lidar_perception.wire import unpacking
+from lidar_perception.wire import compression
 from lidar_perception.wire.clouds import (
     COMPRESSED,
     LIVOX,
     POINT_CLOUD,
     check_readable,
-    cloud_topics,
     decode_cloud,
-    packets_problem,
+    diagnose_packets,
+    find_cloud_topics,
 )
-from lidar_perception.wire.codec import MORE_TYPES, encode, typestore
+from lidar_perception.wire.codec import MORE_TYPES, encode, load_typestore
 from lidar_perception.wire.livox import livox_ros1_to_cdr
 from lidar_perception.wire.messages import to_frame
-from lidar_perception.wire.point_times import point_times
+from lidar_perception.wire.point_times import read_point_times
 from msg_utils.point_cloud2 import to_array
 from msg_utils.stamps import to_ns
 
@@ -38,7 +38,7 @@ def same_points(cloud, points):
 @pytest.mark.parametrize("kind", LIVOX)
 @pytest.mark.parametrize("frame_id", ["", "l", "livox", "livox_fram", "livox_frame"])
 @pytest.mark.parametrize("count", [0, 1, 5])
-def test_a_livox_message_is_a_cloud_with_all_its_columns(kind, frame_id, count):
+def test_livox_message_keeps_all_columns(kind, frame_id, count):
     points = livox_points(count)
     data = encode(livox_message(points, kind.partition("/")[0], frame_id=frame_id))
     for tail in b"", b"\0\0\0":
@@ -47,24 +47,24 @@ def test_a_livox_message_is_a_cloud_with_all_its_columns(kind, frame_id, count):
         assert (to_ns(cloud.header.stamp), cloud.header.frame_id) == (STAMP, frame_id)
 
 
-def test_a_livox_message_in_big_endian_is_read():
+def test_big_endian_livox_message_is_read():
     points, kind = livox_points(), LIVOX[1]
-    data = bytes(typestore().serialize_cdr(livox_message(points), kind, little_endian=False))
+    data = bytes(load_typestore().serialize_cdr(livox_message(points), kind, little_endian=False))
     assert same_points(decode_cloud(data, kind), points)
 
 
-def test_a_livox_cloud_has_intensity_and_times():
+def test_livox_cloud_has_intensity_and_times():
     points = livox_points(7)
     cloud = decode_cloud(encode(livox_message(points)), LIVOX[1])
     frame, indices = to_frame(cloud, 0.0)
     np.testing.assert_allclose(frame.intensity, points["reflectivity"] / 255, atol=1e-6)
-    times = point_times(cloud, indices)
+    times = read_point_times(cloud, indices)
     np.testing.assert_allclose(times.seconds, points["offset_time"] * 1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("frame_id", ["", "livox_frame"])
 @pytest.mark.parametrize("count", [0, 1, 5])
-def test_a_livox_message_of_ros_1_is_the_one_of_ros_2(frame_id, count):
+def test_livox_message_of_ros1_equals_that_of_ros2(frame_id, count):
     store = get_typestore(Stores.ROS1_NOETIC)
     for name, text in MORE_TYPES.items():
         if name.startswith("livox"):
@@ -81,7 +81,7 @@ def test_a_livox_message_of_ros_1_is_the_one_of_ros_2(frame_id, count):
 
 
 @pytest.mark.parametrize("cut", [0, 1, 5, 17, 40, 60, 100])
-def test_a_livox_message_that_was_cut_is_named(cut):
+def test_truncated_livox_message_is_reported(cut):
     data = encode(livox_message(livox_points()))
     with pytest.raises(InputError, match="Livox CustomMsg") as error:
         decode_cloud(data[:cut], LIVOX[1])
@@ -92,7 +92,7 @@ POINTS = np.arange(40, dtype=np.float32).view([(name, "<f4") for name in "xyzi"]
 
 
 @pytest.mark.parametrize("packing", ["zlib", "gzip", "zstd"])
-def test_compressed_clouds_are_unpacked(packing):
+def test_compressed_clouds_are_decompressed(packing):
     for points in POINTS, POINTS[:0]:
         message = compressed_message(points, packing)
         data = encode(message)
@@ -103,9 +103,9 @@ def test_compressed_clouds_are_unpacked(packing):
 
 
 @pytest.mark.parametrize("packing, words", [
-    ("draco", "clouds compressed by draco are not read, only by zlib and zstd: .*"
-              "in_transport:=draco"), ("", "compressed by nothing known")])
-def test_other_compressions_are_refused_by_name(packing, words):
+    ("draco", "compression 'draco' is not supported; supported are zlib and zstd: .*"
+              "in_transport:=draco"), ("", "compression '' is not supported")])
+def test_unsupported_compression_is_reported(packing, words):
     message = compressed_message(POINTS, "draco")
     vars(message)["format"] = packing
     for read in decode_cloud, check_readable:
@@ -114,19 +114,20 @@ def test_other_compressions_are_refused_by_name(packing, words):
 
 
 @pytest.mark.parametrize("packing", ["zlib", "zstd"])
-def test_broken_and_huge_compressed_clouds_are_named(packing, monkeypatch):
-    monkeypatch.setattr(unpacking, "MAX_UNPACKED", 1000)
+def test_damaged_or_huge_compressed_cloud_is_reported(packing, monkeypatch):
+    monkeypatch.setattr(compression, "MAX_BYTES", 1000)
     message = compressed_message(POINTS, packing)
     for content in message.compressed_data[:-9].tobytes(), b"text", COMPRESS[packing](
             bytes(1001)):
         vars(message)["compressed_data"] = np.frombuffer(content, np.uint8)
-        with pytest.raises(InputError, match=f"compressed by {packing} is broken|was cut"):
+        with pytest.raises(InputError, match=f"{packing}-compressed cloud is damaged|was cut"):
             to_frame(decode_cloud(encode(message), COMPRESSED))
 
 
-def test_the_compressed_form_of_a_cloud_is_no_cloud_of_its_own():
-    assert cloud_topics({"/a": POINT_CLOUD, "/a/zlib": COMPRESSED, "/b/zstd": COMPRESSED,
-                         "/c": LIVOX[0], "/d": "std_msgs/msg/String"}) == ["/a", "/b/zstd", "/c"]
+def test_compressed_copy_of_a_topic_is_left_out():
+    topics = {"/a": POINT_CLOUD, "/a/zlib": COMPRESSED, "/b/zstd": COMPRESSED, "/c": LIVOX[0],
+              "/d": "std_msgs/msg/String"}
+    assert find_cloud_topics(topics) == ["/a", "/b/zstd", "/c"]
 
 
 @pytest.mark.parametrize("kind, words", [
@@ -138,7 +139,7 @@ def test_the_compressed_form_of_a_cloud_is_no_cloud_of_its_own():
     ("sensor_msgs/msg/LaserScan", "laser_geometry"),
     ("sensor_msgs/msg/PointCloud", "point_cloud_converter"),
 ])
-def test_packets_of_a_sensor_are_named_with_what_makes_clouds_of_them(kind, words):
-    problem = packets_problem({"/note": "std_msgs/msg/String", "/x": kind})
+def test_sensor_packets_are_reported_with_their_driver(kind, words):
+    problem = diagnose_packets({"/note": "std_msgs/msg/String", "/x": kind})
     assert re.search(words, problem) and "\n" not in problem
-    assert packets_problem({"/x": POINT_CLOUD, "/note": "std_msgs/msg/String"}) is None
+    assert diagnose_packets({"/x": POINT_CLOUD, "/note": "std_msgs/msg/String"}) is None

@@ -1,4 +1,4 @@
-"""Messages: cameras in both kinds of message classes, and bytes that we and ROS read alike."""
+"""Conversion of messages, in both kinds of message classes."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from lidar_perception.camera import Calibration, Camera
 from lidar_perception.types import Detections, InputError
 from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.messages import (
-    camera_info,
-    camera_of,
-    column,
-    detection_markers,
-    extrinsics,
-    intensity_problem,
+    diagnose_intensity,
+    make_camera_info,
+    make_detection_markers,
+    make_extrinsics,
+    read_camera,
+    read_column,
     to_frame,
 )
 from lidar_perception.wire.topics import CAMERA_FRAME
@@ -26,18 +26,18 @@ from msg_utils.point_cloud2 import from_array
 
 
 @each_make
-def test_the_camera_is_the_same_from_either_direction_of_the_transform(make):
-    info = camera_info(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
-    forth = extrinsics(CALIBRATION, header(make), make)
-    back = extrinsics(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
+def test_extrinsics_are_read_in_either_direction(make):
+    info = make_camera_info(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
+    forth = make_extrinsics(CALIBRATION, header(make), make)
+    back = make_extrinsics(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
     back.child_frame_id = "velodyne"
     inverse = np.linalg.inv(CALIBRATION.lidar_to_camera)
-    turned = Calibration(CALIBRATION.intrinsics, inverse, 1, 1).pose
+    inverse_pose = Calibration(CALIBRATION.intrinsics, inverse, 1, 1).pose
     q, t = back.transform.rotation, back.transform.translation
-    (q.x, q.y, q.z, q.w), (t.x, t.y, t.z) = (map(float, v) for v in turned)
+    (q.x, q.y, q.z, q.w), (t.x, t.y, t.z) = (map(float, v) for v in inverse_pose)
     expected = CALIBRATION.intrinsics @ CALIBRATION.lidar_to_camera
     for transform in (forth, back):
-        camera = camera_of(info, transform)
+        camera = read_camera(info, transform)
         np.testing.assert_allclose(camera.projection, expected, atol=1e-9)
         assert (camera.width, camera.height) == (1242, 375)
 
@@ -55,15 +55,15 @@ def test_the_camera_is_the_same_from_either_direction_of_the_transform(make):
     (lambda info, tf: setattr(info, "p", np.r_[info.p[:11], np.inf]), "not finite"),
     (lambda info, tf: setattr(info, "width", 2**32 - 1), "4294967295 x 375 pixels"),
 ])
-def test_a_camera_that_cannot_be_used_is_an_input_error(make, change, words):
-    info = camera_info(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
-    transform = extrinsics(CALIBRATION, header(make), make)
+def test_unusable_camera_is_an_input_error(make, change, words):
+    info = make_camera_info(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
+    transform = make_extrinsics(CALIBRATION, header(make), make)
     change(info, transform)
     with pytest.raises(InputError, match=words):
-        camera_of(info, transform)
+        read_camera(info, transform)
 
 
-def test_a_point_is_in_view_where_its_pixel_is_in_the_image():
+def test_point_is_in_view_if_its_pixel_is_in_the_image():
     camera = Camera(np.array([[10.0, 0, 50, 0], [0, 10, 20, 0], [0, 0, 1, 0]]), 100, 40)
     points = np.array([[0, 0, 1], [0, 0, -1], [-5.01, 0, 1], [4.99, 0, 1], [5.01, 0, 1],
                        [0, 1.99, 1], [0, 2.01, 1], [0, -2.01, 1]], np.float32)
@@ -75,11 +75,11 @@ MESSAGES = {
         np.arange(24, dtype="<f4").view([("x", "<f4"), ("", "V4"), ("y", "<f4"), ("z", "<f4")])[
             ["x", "y", "z"]], header(make), make, height=2),
     "no points": lambda make: from_array(np.zeros(0, [("x", "<f4")]), header(make), make),
-    "markers": lambda make: detection_markers(
+    "markers": lambda make: make_detection_markers(
         Detections.of([[1, 2, 3, 4, 5, 6, 0.5]] * 2, [3, 0], [0.25, 1]), header(make), make,
         {("Car", 9)}),
-    "camera": lambda make: camera_info(CALIBRATION, header(make), make),
-    "transform": lambda make: extrinsics(CALIBRATION, header(make), make),
+    "camera": lambda make: make_camera_info(CALIBRATION, header(make), make),
+    "transform": lambda make: make_extrinsics(CALIBRATION, header(make), make),
 }
 
 
@@ -98,7 +98,7 @@ def test_ros_and_rosbags_read_each_others_bytes(build):
 @pytest.mark.parametrize("name", ["sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/Pose",
                                   "sensor_msgs/msg/CameraInfo", "visualization_msgs/msg/Marker",
                                   "diagnostic_msgs/msg/DiagnosticArray"])
-def test_a_message_without_fields_is_all_zero_as_in_ros(name):
+def test_message_fields_default_to_zero_as_in_ros(name):
     serialization = pytest.importorskip("rclpy.serialization", reason="needs rclpy")
     theirs = ros_message(name)
     if name.endswith(("Pose", "Marker")):  # ROS starts at the unit quaternion
@@ -108,43 +108,43 @@ def test_a_message_without_fields_is_all_zero_as_in_ros(name):
     assert got == theirs
 
 
-def test_a_field_that_is_not_there_is_a_type_error():
+def test_unknown_field_is_a_type_error():
     with pytest.raises(TypeError, match="has no field 'colour'"):
         bag_message("visualization_msgs/msg/Marker", colour=1)
 
 
-def test_bytes_that_are_no_message_are_an_input_error():
+def test_truncated_message_is_an_input_error():
     raw = encode(MESSAGES["markers"](bag_message))
     for size in range(0, len(raw), 7):
-        with pytest.raises(InputError, match=f"^{size} bytes are no visualization_msgs"):
+        with pytest.raises(InputError, match=f"^{size} bytes are not a valid visualization_msgs"):
             decode(raw[:size], "visualization_msgs/msg/MarkerArray")
 
 
 @each_make
 @pytest.mark.parametrize("name", ["in_view", "ground", "cluster_id"])
-def test_a_column_with_more_than_one_number_a_point_is_named(make, name):
+def test_field_with_several_numbers_per_point_is_rejected(make, name):
     kind = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, "<u4", 2)]
     msg = from_array(np.ones(3, kind), header(make), make)
     with pytest.raises(InputError, match=f"'{name}' has count > 1"):
-        column(msg, name, to_frame(msg)[1])
+        read_column(msg, name, to_frame(msg)[1])
 
 
 @pytest.mark.parametrize("kind, full", [("<f4", 1), ("<f4", 255), ("<f8", 65535), ("u1", 255),
                                         ("<u2", 65535)])
-def test_the_same_intensities_are_read_in_every_drivers_scale(kind, full):
-    said = np.random.default_rng(0).uniform(0, 1, 3000) ** 3
-    said[0] = 1.0
-    points = np.ones(len(said), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", kind)])
-    points["intensity"] = np.round(said * full) if full > 1 else said
+def test_intensities_are_read_in_every_drivers_scale(kind, full):
+    expected = np.random.default_rng(0).uniform(0, 1, 3000) ** 3
+    expected[0] = 1.0
+    points = np.ones(len(expected), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", kind)])
+    points["intensity"] = np.round(expected * full) if full > 1 else expected
     read = to_frame(from_array(points, header(bag_message), bag_message), 0.0)[0]
-    np.testing.assert_allclose(read.intensity, said, atol=0.5 / 255)
-    assert read.intensity.dtype == np.float32 and intensity_problem(read) is None
+    np.testing.assert_allclose(read.intensity, expected, atol=0.5 / 255)
+    assert read.intensity.dtype == np.float32 and diagnose_intensity(read) is None
     if np.dtype(kind).kind == "f":
         points["intensity"][1:4] = np.nan, np.inf, -np.inf
         odd = to_frame(from_array(points, header(bag_message), bag_message), 0.0)[0].intensity
         assert not odd[1:4].any() and np.array_equal(odd[4:], read.intensity[4:])
-    points["intensity"] = points["intensity"] * 0.02  # of a scale that no driver has
+    points["intensity"] = points["intensity"] * 0.02  # a scale that no driver uses
     dark = to_frame(from_array(points, header(bag_message), bag_message), float(full))[0]
-    assert "input.intensity_max" in intensity_problem(dark)
-    assert "input.intensity_max" in intensity_problem(replace(dark, intensity=read.intensity * 2))
-    assert intensity_problem(dark.take(np.arange(100))) is None
+    assert "input.intensity_max" in diagnose_intensity(dark)
+    assert "input.intensity_max" in diagnose_intensity(replace(dark, intensity=read.intensity * 2))
+    assert diagnose_intensity(dark.take(np.arange(100))) is None

@@ -1,4 +1,4 @@
-"""Times of points as drivers give them, in their own units, types and names."""
+"""Times of points in the units, types and column names of various drivers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from samples import STAMP, header
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_frame
-from lidar_perception.wire.point_times import moved_cloud, point_times
+from lidar_perception.wire.point_times import read_point_times, replace_points
 from msg_utils.point_cloud2 import from_array, to_array
 
 SECONDS = np.linspace(0.0, 0.0999, 1000)
@@ -36,81 +36,82 @@ def cloud(name, values, order="<"):
     return from_array(points, header(bag_message), bag_message)
 
 
-def every(msg):
+def all_indices(msg):
     return np.arange(msg.width)
 
 
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("order", "<>")
-def test_each_driver_means_the_same_seconds(driver, order):
+def test_times_of_every_driver_are_read_in_seconds(driver, order):
     name, values = DRIVERS[driver]
     msg = cloud(name, values, order)
     expected = SECONDS - (0.0999 if "end" in driver else 0.0)
-    times = point_times(msg, every(msg))
+    times = read_point_times(msg, all_indices(msg))
     assert times.name == name
     np.testing.assert_allclose(times.seconds, expected, atol=2e-6)
-    for some in ([7, 3, 999], [500], range(500, 505)):  # the last span 0.4 ms, no turn
-        np.testing.assert_array_equal(point_times(msg, np.array(some)).seconds,
+    for some in ([7, 3, 999], [500], range(500, 505)):  # the last spans 0.4 ms only
+        np.testing.assert_array_equal(read_point_times(msg, np.array(some)).seconds,
                                       times.seconds[some])
 
 
 @pytest.mark.parametrize("driver", DRIVERS)
-def test_a_corrected_cloud_is_at_its_stamp_and_else_the_same(driver):
+def test_replaced_points_have_the_time_of_the_stamp(driver):
     name, values = DRIVERS[driver]
     msg = cloud(name, values)
     chosen = np.arange(0, 1000, 3)
     frame, _ = to_frame(msg)
     moved = frame.xyz[chosen] + np.float32([1, 2, 3])
-    times = point_times(msg, chosen)
-    after = moved_cloud(msg, bag_message, chosen, moved, times)
+    times = read_point_times(msg, chosen)
+    after = replace_points(msg, bag_message, chosen, moved, times)
     assert [f.name for f in after.fields] == [f.name for f in msg.fields]
     assert (after.point_step, after.width) == (msg.point_step, msg.width)
     np.testing.assert_array_equal(to_frame(after)[0].xyz[chosen], moved)
-    others = np.setdiff1d(every(msg), chosen)
+    others = np.setdiff1d(all_indices(msg), chosen)
     np.testing.assert_array_equal(to_array(after)[others][["x", "y", "z", "intensity"]],
                                   to_array(msg)[others][["x", "y", "z", "intensity"]])
-    np.testing.assert_allclose(point_times(after, every(msg)).seconds, 0.0, atol=1e-6)
+    np.testing.assert_allclose(read_point_times(after, all_indices(msg)).seconds, 0.0, atol=1e-6)
 
 
-def test_a_part_of_a_turn_has_the_unit_of_its_type():
+def test_short_cloud_has_the_unit_of_its_type():
     for name, values, seconds in [("t", np.array([4_000_000, 4_000_001], "<u4"), [4e-3, 4e-3]),
                                   ("time", np.array([0.01, 0.0105], "<f4"), [0.01, 0.0105]),
                                   ("timestamp", np.array([STAMP, STAMP + 10**6], "<f8"),
                                    [0.0, 1e-3])]:
         msg = cloud(name, values)
-        np.testing.assert_allclose(point_times(msg, every(msg)).seconds, seconds, atol=1e-6)
+        times = read_point_times(msg, all_indices(msg))
+        np.testing.assert_allclose(times.seconds, seconds, atol=1e-6)
 
 
-def test_a_point_without_a_time_has_none():
+def test_nan_times_stay_nan():
     values = SECONDS.copy()
     values[::10] = np.nan
-    seconds = point_times(cloud("time", values), np.arange(1000)).seconds
+    seconds = read_point_times(cloud("time", values), np.arange(1000)).seconds
     np.testing.assert_array_equal(np.isnan(seconds), np.isnan(values))
 
 
 @pytest.mark.parametrize("name, values, words", [
-    ("ring", np.arange(9, dtype="<u2"), "no column of times .*it has x, y, z, intensity, ring"),
-    ("timestamp", STAMP * 1e-9 + SECONDS + 37.0, "37.100 s from header.stamp; do sensor and"),
+    ("ring", np.arange(9, dtype="<u2"), "no time column .*are: x, y, z, intensity, ring"),
+    ("timestamp", STAMP * 1e-9 + SECONDS + 37.0, "37.100 s from header.stamp; are the clocks"),
     ("t", np.array([0, 3 * 10**9], "<u4"), "3.000 s from header.stamp"),
-    ("time", np.full(5, np.nan), "no time in the column 'time' is a number"),
+    ("time", np.full(5, np.nan), "all times in the column 'time' are NaN"),
     ("time", np.zeros((5, 2), "<f4"), "count > 1"),
 ])
-def test_times_that_cannot_be_used_are_named(name, values, words):
+def test_unusable_times_are_reported(name, values, words):
     points = np.zeros(len(values), [(n, "<f4") for n in ("x", "y", "z", "intensity")]
                       + [(name, values.dtype, values.shape[1:])])
     points[name] = values
     msg = from_array(points, header(bag_message), bag_message)
     with pytest.raises(InputError, match=words):
-        point_times(msg, every(msg))
+        read_point_times(msg, all_indices(msg))
 
 
-def test_what_the_column_says_of_beams_without_a_return_does_not_count():
-    """Drivers fill organised clouds with zeros where nothing came back."""
+def test_times_of_missing_returns_are_ignored():
+    """Drivers fill organised clouds with zeros where a beam has no return."""
     values = np.where(np.arange(1000) % 3, STAMP * 1e-9 + SECONDS, 0.0)
-    msg, there = cloud("timestamp", values), np.flatnonzero(np.arange(1000) % 3)
-    for some in (there, there[500:503]):
-        np.testing.assert_allclose(point_times(msg, some).seconds, SECONDS[some], atol=1e-6)
+    msg, returns = cloud("timestamp", values), np.flatnonzero(np.arange(1000) % 3)
+    for some in (returns, returns[500:503]):
+        np.testing.assert_allclose(read_point_times(msg, some).seconds, SECONDS[some], atol=1e-6)
     one = np.full(1000, np.nan)
     one[0] = 0.05
-    with pytest.raises(InputError, match="is a number"):
-        point_times(cloud("time", one), np.arange(1, 1000))
+    with pytest.raises(InputError, match="are NaN or infinite"):
+        read_point_times(cloud("time", one), np.arange(1, 1000))

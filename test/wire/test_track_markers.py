@@ -1,4 +1,4 @@
-"""Tracks as markers: boxes that are read back, and what is drawn beside them."""
+"""Tracks as markers."""
 
 from __future__ import annotations
 
@@ -10,18 +10,24 @@ from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import odometry, pose_of, to_detections
-from lidar_perception.wire.track_markers import DRAWN, MAX_ID, NUMBER, VELOCITY, track_markers
+from lidar_perception.wire.messages import make_odometry, read_pose, to_detections
+from lidar_perception.wire.track_markers import (
+    EXTRA_NAMESPACES,
+    MAX_ID,
+    NUMBER,
+    VELOCITY,
+    make_track_markers,
+)
 from msg_utils.markers import ADD, DELETE, from_marker_array, marker_keys
 
 
-def arrays(make, frames=20):
-    """Tracks and their markers of each frame; every array knows the one before."""
+def make_frames(make, frames=20):
+    """Yield the tracks and markers of each frame; each array gets the previous one."""
     tracker, trails, shown = Tracker(), Trails(), ()
     for i, found in enumerate(crowd(4, frames)):
         stamp = START + i * TENTH
         tracks = tracker(found if i < 12 else Detections.none(), stamp)
-        message = track_markers(
+        message = make_track_markers(
             tracks.ids, tracks.detections, tracks.velocities, tracks.moving,
             trails(tracks, tracker.pose, stamp, 2.0), header(make, stamp), make, previous=shown,
             lifetime_ns=10**9)
@@ -30,8 +36,8 @@ def arrays(make, frames=20):
 
 
 @each_make
-def test_tracks_are_read_back_from_the_boxes_and_the_rest_is_drawn_with_their_ids(make):
-    for tracks, message in arrays(make):
+def test_tracks_are_read_back_from_their_markers(make):
+    for tracks, message in make_frames(make):
         objects = from_marker_array(message)
         assert objects.ids.tolist() == tracks.ids.tolist()
         found = to_detections(objects)
@@ -53,28 +59,26 @@ def test_tracks_are_read_back_from_the_boxes_and_the_rest_is_drawn_with_their_id
 
 
 @each_make
-def test_every_array_deletes_what_the_one_before_showed_and_it_does_not(make):
+def test_each_array_deletes_outdated_markers(make):
     before = frozenset()
-    for _, message in arrays(make, 60):
+    for _, message in make_frames(make, 60):
         deleted = {(m.ns, m.id) for m in message.markers if m.action == DELETE and m.ns}
         assert deleted == before - marker_keys(message)
         before = marker_keys(message)
-    assert not before and message.markers  # nothing is left, and the array says when that was
+    assert not before and message.markers  # an array without boxes still has a stamp
 
 
-def test_an_id_beyond_those_of_markers_begins_again():
+def test_large_ids_wrap_around():
     found = Detections.of([[1, 2, 3, 4, 5, 6, 0]], CAR, 0.5)
-    message = track_markers(np.array([MAX_ID + 7]), found, np.zeros((1, 2)), np.zeros(1),
-                            [np.zeros((1, 3))], header(bag_message), bag_message)
+    message = make_track_markers(np.array([MAX_ID + 7]), found, np.zeros((1, 2)), np.zeros(1),
+                                 [np.zeros((1, 3))], header(bag_message), bag_message)
     assert {(m.ns, m.id) for m in message.markers} == {(CLASSES[CAR], 7), (NUMBER, 7)}
-    assert set(DRAWN).isdisjoint(CLASSES)
-
-
+    assert set(EXTRA_NAMESPACES).isdisjoint(CLASSES)
 
 
 @each_make
-def test_odometry_holds_a_pose(make):
+def test_odometry_keeps_the_pose(make):
     at = pose(3.0, -4.0, 2.5)
-    message = odometry(at, header(make, frame_id="odom"), "velodyne", make)
-    np.testing.assert_allclose(pose_of(message.pose.pose), at, atol=1e-12)
+    message = make_odometry(at, header(make, frame_id="odom"), "velodyne", make)
+    np.testing.assert_allclose(read_pose(message.pose.pose), at, atol=1e-12)
     assert (message.header.frame_id, message.child_frame_id) == ("odom", "velodyne")
