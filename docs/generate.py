@@ -1,4 +1,4 @@
-"""Makes docs/nodes/*.md from the parameter dataclasses, config/best.param.yaml from
+"""Makes docs/reference/nodes/*.md from the parameter dataclasses, config/best.param.yaml from
 configurations.py, and those of the detectors with a network from their parameters:
 python docs/generate.py
 
@@ -24,7 +24,7 @@ from lidar_perception.param_fields import flatten
 
 CONFIG = Path(__file__).parents[1] / "config"
 BEST = CONFIG / "best.param.yaml"
-FOLDER = Path(__file__).parent / "nodes"
+FOLDER = Path(__file__).parent / "reference" / "nodes"
 CLOUD, MARKERS = "sensor_msgs/PointCloud2", "visualization_msgs/MarkerArray"
 STRING_TIMES = "std_msgs/Float64"
 
@@ -76,7 +76,7 @@ ALWAYS_OUT = [
      "reason, counts, rate, lost and dropped clouds, subscribers of the outputs."),
 ]
 MANAGED_OUT = [("~/transition_event", "lifecycle_msgs/TransitionEvent", "Each change of the state, "
-                "see [lifecycle](../lifecycle.md).")]
+                "see [lifecycle](../../how-to/lifecycle.md).")]
 MANAGED_SERVICES = [
     ("~/change_state", "lifecycle_msgs/ChangeState", "Configure, activate, deactivate, clean up, "
      "shut down."),
@@ -84,7 +84,7 @@ MANAGED_SERVICES = [
 ]
 OBSTACLES_OUT = ("~/output/obstacles", CLOUD, "x y z, and intensity where the cloud has one, of "
                  "the points that are no ground and within the heights of `obstacles`, for a "
-                 "costmap ([nav2](../nav2.md)); made only while subscribed.")
+                 "costmap ([nav2](../../how-to/nav2.md)); made only while subscribed.")
 COLUMNS = "columns `ground` (uint8, 1 = ground) and `in_view` (uint8, 1 = processed)"
 
 PAGES: dict[str, dict[str, Any]] = {
@@ -128,7 +128,7 @@ PAGES: dict[str, dict[str, Any]] = {
     "pointpillars_detector": dict(
         params=DetectorParams(),
         what="Detects cars, pedestrians and cyclists: PointPillars and the four versions of "
-             "EG-PointPillars, see [detection](../detection.md). Loads and warms up before it "
+             "EG-PointPillars, see [detection](../../explanation/pointpillars.md). Loads and warms up before it "
              "subscribes. Without weights it says so in a diagnostic and publishes nothing. Warns "
              "if nothing can be found (the cloud is out of range, has no intensity, all of it is "
              "ground ...), if CUDA is asked for and missing or out of memory, and if height or "
@@ -144,7 +144,7 @@ PAGES: dict[str, dict[str, Any]] = {
     "pointnet_detector": dict(
         params=PointNetDetectorParams(),
         what="Detects cars, pedestrians and cyclists among the clusters of the whole cloud: each "
-             "is classified and gets a box, see [pointnet](../pointnet.md). Loads and warms up "
+             "is classified and gets a box, see [pointnet](../../explanation/pointnet.md). Loads and warms up "
              "before it subscribes. Without weights it says so in a diagnostic and publishes "
              "nothing. "
              "Warns if nothing can be found (no clusters, all of them too small, no intensity "
@@ -161,7 +161,7 @@ PAGES: dict[str, dict[str, Any]] = {
         params=FusedDetectorParams(),
         what="Detects cars, pedestrians and cyclists: PointPillars proposes, silhouettes and the "
              "cluster network judge, and the score is the probability that something is there, see "
-             "[fused](../fused.md). Loads and warms up before it subscribes. Without weights it "
+             "[fused](../../explanation/fused.md). Loads and warms up before it subscribes. Without weights it "
              "says so in a diagnostic and publishes nothing, and it warns as pointpillars_detector "
              "does. Files: `launch/fused.launch.py`, `config/fused.param.yaml`.",
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape. The columns "
@@ -173,7 +173,7 @@ PAGES: dict[str, dict[str, Any]] = {
     "tracker": dict(
         params=params.TrackerNodeParams(),
         what="Follows the detections of any detector: ids that stay, velocities, and scores that "
-             "are the evidence over time, see [tracking](../tracking.md). A frame that was lost is "
+             "are the evidence over time, see [tracking](../../explanation/tracking.md). A frame that was lost is "
              "predicted over with the next one, and has no answer of its own; one that is late, or "
              "has the stamp of the last one, is not answered; "
              "time that jumps, as of a bag that is played again, ends all tracks. Warns of "
@@ -278,7 +278,7 @@ def _parameter_file(what: str, values: dict[str, Any]) -> str:
             place = place.setdefault(group, {})
         place[name] = list(value) if isinstance(value, tuple) else value
     return (f"# {what}; made by docs/generate.py.\n"
-            "# Every parameter with its unit, range and default: docs/nodes/.\n"
+            "# Every parameter with its unit, range and default: docs/reference/nodes/.\n"
             + yaml.safe_dump({"/**": {"ros__parameters": tree}}, sort_keys=False))
 
 

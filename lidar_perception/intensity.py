@@ -1,7 +1,7 @@
 """The scale of intensities: drivers write 0..1, percent, 8, 10, 12 or 16 bits; the core takes 0..1.
 
 Every source goes through `full_scale`, which infers the scale where nobody declares it, and
-`to_unit`, which applies it. See docs/segmentation.md#intensity.
+`to_unit`, which applies it. See docs/reference/recordings.md#intensity.
 """
 
 from __future__ import annotations

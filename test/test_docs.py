@@ -34,12 +34,12 @@ def test_help_of_a_node_names_every_parameter(generate, name):
 
 
 def test_every_node_has_a_page():
-    assert {p.stem for p in (ROOT / "docs/nodes").iterdir()} == set(NODES)
+    assert {p.stem for p in (ROOT / "docs/reference/nodes").iterdir()} == set(NODES)
 
 
 @pytest.mark.parametrize("name", NODES)
 def test_pages_are_made_from_the_code(generate, name):
-    assert (ROOT / "docs" / "nodes" / f"{name}.md").read_text() == generate.page(name), \
+    assert (ROOT / "docs" / "reference" / "nodes" / f"{name}.md").read_text() == generate.page(name), \
         "run: python docs/generate.py"
 
 

@@ -1,4 +1,4 @@
-"""docs/extend.md: each example is carried out in a copy of the package, with what the page says and
+"""docs/how-to/extend.md: each example is carried out in a copy of the package, with what the page says and
 nothing else, and its command runs."""
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from samples import object_folder, scene
 pytestmark = pytest.mark.no_cover  # others run these lines
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = (ROOT / "docs" / "extend.md").read_text()
+PAGE = (ROOT / "docs" / "how-to" / "extend.md").read_text()
 PARTS = re.findall(r"`(lidar_perception/[\w/]+\.py)`:\n\n```(python|diff)\n(.*?)```", PAGE, re.S)
 EXAMPLES = {"npy": 2, "sizes": 2, "lowest": 3}  # name -> files that it touches
 

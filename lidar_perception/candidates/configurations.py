@@ -11,7 +11,7 @@ from lidar_perception.param_fields import with_values
 PAPER_VALUES = {"view.enabled": True, "seed.source": "ground_truth"}
 
 # These values found most pedestrians on frames that they were not tuned on, with every seed source.
-# docs/reproduce.md has the figures.
+# docs/how-to/evaluate.md has the figures.
 BEST_VALUES = {
     "clustering.density": FULL_DENSITY,
     "clustering.dbscan.range_limits": (15.0, 30.0, 45.0),

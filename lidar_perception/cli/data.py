@@ -17,7 +17,7 @@ from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
 
-# docs/recordings.md has the complete list.
+# docs/reference/recordings.md has the complete list.
 WHAT = ("Bag (ROS 2 or ROS 1), KITTI, nuScenes or SemanticKITTI folder, .pcd, .ply, .npy or .bin "
         "files, or the output of `simulate`. BAG:/TOPIC names the clouds of a bag that has "
         "several.")

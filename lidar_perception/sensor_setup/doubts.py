@@ -67,7 +67,7 @@ def doubts(m: Measured) -> list[str]:
         out.append("the rate cannot be told without stamps or times; set rate in sensor.yaml")
     if m.timing.missing > MANY_LOST * m.total:
         out.append(f"{m.timing.missing} clouds are missing between the stamps: the recorder or the "
-                   "network lost them; see docs/reliability.md")
+                   "network lost them; see docs/explanation/reliability.md")
     if m.timing.backwards:
         out.append(f"{m.timing.backwards} stamps are not after the one before: two sources share "
                    "the topic, or clocks jump; synchronise the sensor's clock")

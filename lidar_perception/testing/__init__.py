@@ -12,7 +12,7 @@
 Fixtures: `peer`, a node of the test's own; `processes`, whose logs are shown when a test fails;
 `shared_peer` and `shared_processes`, for all tests of a module; `domain`, a ROS domain that nobody
 else uses; `make_bag` and `drive_bag`. Functions: `detections.assert_detections`, `bags.recording`,
-and `launching` for launch_testing. docs/testing.md has a whole test.
+and `launching` for launch_testing. docs/how-to/test-your-stack.md has a whole test.
 
 There is no entry point: whoever does not name this plugin does not load it. To load it takes pytest
 and the standard library; ROS is imported by the fixtures that need it.

@@ -59,4 +59,4 @@ def description(*actions: Any) -> Any:
 def _missing(error: ModuleNotFoundError) -> InputError:
     package = str(error.name).partition(".")[0].replace("_", "-")
     return InputError(f"{error.name} is not installed; it comes with ROS 2 (ros-jazzy-{package}); "
-                      "with pytest alone see docs/testing.md")
+                      "with pytest alone see docs/how-to/test-your-stack.md")

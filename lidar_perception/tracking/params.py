@@ -1,4 +1,4 @@
-"""Parameters of the tracker. Chosen on simulated drives, see docs/tracking.md."""
+"""Parameters of the tracker. Chosen on simulated drives, see docs/how-to/track.md."""
 
 from __future__ import annotations
 

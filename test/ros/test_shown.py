@@ -29,7 +29,7 @@ from lidar_perception.wire.topics import POINTS
 from msg_utils.point_cloud2 import to_array
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
-NAV2 = Path(__file__).resolve().parents[2] / "docs" / "nav2.md"
+NAV2 = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "nav2.md"
 CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
 # Nav2's obstacle_layer.cpp (jazzy) and spatio_temporal_voxel_layer.cpp
 NAV2_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT,

@@ -1,4 +1,4 @@
-"""docs/testing.md: its files are written to a folder, and its commands run there."""
+"""docs/how-to/test-your-stack.md: its files are written to a folder, and its commands run there."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = re.findall(r"`(\w+\.py)`[^`]*?:?\n(?:[^`]*\n)?\n?```python\n(.*?)```",
-                   (ROOT / "docs/testing.md").read_text(), re.S)
+                   (ROOT / "docs/how-to/test-your-stack.md").read_text(), re.S)
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
