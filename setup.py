@@ -104,6 +104,7 @@ setup(
                  "playwright>=1.50", "pytest-cov>=7.0", "pytest-xdist>=3.7", "ruff>=0.9",
                  "setuptools>=70.1", "shapely>=2.0"],
         "studio": ["aiohttp>=3.9"],
+        "docs": ["mkdocs-material>=9.5", "mkdocstrings[python]>=0.26"],
         "distributed": ["distributed>=2024.1"],
         "odometry": ["kiss-icp>=1.2"],
         "onnx": ["onnx>=1.16", "onnxruntime>=1.18", "onnxscript>=0.2", "torch>=2.6"],

@@ -28,6 +28,19 @@ FOLDER = Path(__file__).parent / "reference" / "nodes"
 CLOUD, MARKERS = "sensor_msgs/PointCloud2", "visualization_msgs/MarkerArray"
 STRING_TIMES = "std_msgs/Float64"
 
+# Parameters that users need first, in this order; a node's page folds all others.
+FIRST = (
+    "bag", "topics", "rate", "loop", "wait_for", "follow", "file", "stages",
+    "fused.scores.pedestrian", "fused.scores.car", "fused.scores.cyclist", "fused.range",
+    "fused.weights", "fused.device", "pointpillars.version", "pointpillars.weights",
+    "pointpillars.range", "pointpillars.scores.car", "pointpillars.scores.pedestrian",
+    "pointpillars.device", "pointnet.weights", "pointnet.scores.car", "pointnet.scores.pedestrian",
+    "pointnet.device", "seed.source", "seed.file", "stm.threshold", "clustering.method",
+    "ground.method", "base_frame", "target_frame", "ground.sensor_pose.height",
+    "input.intensity_max", "input.ahead", "input.deskew", "crop.body", "tracking.enabled",
+    "ego.source", "tracking.report", "tracking.max_gap", "output.trail", "autostart",
+)
+
 CAMERA_IN = [
     ("~/input/camera_info", "sensor_msgs/CameraInfo", "P and the image size; latched. Only needed "
      "with `view.enabled`."),
@@ -90,9 +103,10 @@ COLUMNS = "columns `ground` (uint8, 1 = ground) and `in_view` (uint8, 1 = proces
 PAGES: dict[str, dict[str, Any]] = {
     "ground_segmentation": dict(
         params=params.GroundNodeParams(),
-        what="Marks the ground points of a cloud, by one plane, by Patchwork++ or by a cloth "
-             "simulation (`ground.method`). Warns if the sensor is mounted at another height than "
-             "`sensor_pose` says, and if the scale of the intensity does not fit.",
+        what="Marks the ground points of a cloud, by one plane, by Patchwork++ or by a cloth"
+             " simulation (`ground.method`). Warns if the sensor is mounted at another "
+             "height than `sensor_pose` says, and if the scale of the intensity does not "
+             "fit.",
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape."), *CAMERA_IN],
         outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS}."),
                  ("~/output/ground", CLOUD, "Ground points only; made only while subscribed."),
@@ -100,8 +114,8 @@ PAGES: dict[str, dict[str, Any]] = {
                  OBSTACLES_OUT]),
     "clustering": dict(
         params=params.ClusteringNodeParams(),
-        what="Clusters the points that are not ground: distance-aware DBSCAN, exact, or adaptive "
-             "Euclidean clustering (`clustering.method`).",
+        what="Clusters the points that are not ground: distance-aware DBSCAN, exact, or "
+             "adaptive Euclidean clustering (`clustering.method`).",
         inputs=[("~/input/points", CLOUD, "With column `ground`; without it everything is "
                  "clustered and a diagnostic says so.")],
         outputs=[("~/output/points", CLOUD, "The same cloud with the column `cluster_id` (uint32, "
@@ -110,14 +124,14 @@ PAGES: dict[str, dict[str, Any]] = {
                   "`size_class` by the diagonal. Made only while subscribed.")]),
     "candidate_refinement": dict(
         params=params.RefinementNodeParams(),
-        what="Finds pedestrian candidates among clusters: ground snapping, height filter, single "
-             "template matching, centralized point augmentation.",
+        what="Finds pedestrian candidates among clusters: ground snapping, height filter, "
+             "single template matching, centralized point augmentation.",
         inputs=[("~/input/points", CLOUD, "With columns `ground` and `cluster_id`."), *SEED_IN],
         outputs=CANDIDATES_OUT),
     "perception": dict(
         params=PipelineParams(),
-        what="The three stages in one process, with the same parameters and results and without "
-             "the copies between them.",
+        what="The three stages in one process, with the same parameters and results and "
+             "without the copies between them.",
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape."), *CAMERA_IN,
                 *SEED_IN],
         outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS} and `cluster_id`; "
@@ -127,14 +141,14 @@ PAGES: dict[str, dict[str, Any]] = {
                  *CANDIDATES_OUT]),
     "pointpillars_detector": dict(
         params=DetectorParams(),
-        what="Detects cars, pedestrians and cyclists: PointPillars and the four versions of "
-             "EG-PointPillars, see [detection](../../explanation/pointpillars.md). Loads and warms up before it "
-             "subscribes. Without weights it says so in a diagnostic and publishes nothing. Warns "
-             "if nothing can be found (the cloud is out of range, has no intensity, all of it is "
-             "ground ...), if CUDA is asked for and missing or out of memory, and if height or "
-             "intensity do not fit; where every score is below its threshold the diagnostic has "
-             "the best ones. Files: `launch/pointpillars.launch.py`, "
-             "`config/pointpillars.param.yaml`.",
+        what="Detects cars, pedestrians and cyclists with PointPillars and the four versions"
+             " of EG-PointPillars ([how](../../explanation/pointpillars.md)). Loads and "
+             "warms up before it subscribes. Without weights it says so in a diagnostic and "
+             "publishes nothing. Warns if nothing can be found (the cloud is out of range, "
+             "has no intensity, all of it is ground ...), if CUDA is asked for and missing "
+             "or out of memory, and if height or intensity do not fit; where every score is "
+             "below its threshold the diagnostic has the best ones. Files: "
+             "`launch/pointpillars.launch.py`, `config/pointpillars.param.yaml`.",
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape. The columns "
                  "`ground` and `cluster_id` are used where they are there; what else the version "
                  "needs is computed.")],
@@ -143,14 +157,14 @@ PAGES: dict[str, dict[str, Any]] = {
                   "Time of each step.")]),
     "pointnet_detector": dict(
         params=PointNetDetectorParams(),
-        what="Detects cars, pedestrians and cyclists among the clusters of the whole cloud: each "
-             "is classified and gets a box, see [pointnet](../../explanation/pointnet.md). Loads and warms up "
-             "before it subscribes. Without weights it says so in a diagnostic and publishes "
-             "nothing. "
-             "Warns if nothing can be found (no clusters, all of them too small, no intensity "
-             "...), if CUDA is asked for and missing or out of memory, and if height or intensity "
-             "do not fit; where every score is below its threshold the diagnostic has the best "
-             "ones. Files: `launch/pointnet.launch.py`, `config/pointnet.param.yaml`.",
+        what="Detects cars, pedestrians and cyclists among the clusters of the whole cloud: "
+             "each is classified and gets a box ([how](../../explanation/pointnet.md)). "
+             "Loads and warms up before it subscribes. Without weights it says so in a "
+             "diagnostic and publishes nothing. Warns if nothing can be found (no clusters, "
+             "all of them too small, no intensity ...), if CUDA is asked for and missing or "
+             "out of memory, and if height or intensity do not fit; where every score is "
+             "below its threshold the diagnostic has the best ones. Files: "
+             "`launch/pointnet.launch.py`, `config/pointnet.param.yaml`.",
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape. The column "
                  "`cluster_id` is used where it is there, or else the column `ground`; what is "
                  "missing is computed.")],
@@ -159,11 +173,12 @@ PAGES: dict[str, dict[str, Any]] = {
                   STRING_TIMES, "Time of each step.")]),
     "fused_detector": dict(
         params=FusedDetectorParams(),
-        what="Detects cars, pedestrians and cyclists: PointPillars proposes, silhouettes and the "
-             "cluster network judge, and the score is the probability that something is there, see "
-             "[fused](../../explanation/fused.md). Loads and warms up before it subscribes. Without weights it "
-             "says so in a diagnostic and publishes nothing, and it warns as pointpillars_detector "
-             "does. Files: `launch/fused.launch.py`, `config/fused.param.yaml`.",
+        what="Detects cars, pedestrians and cyclists: PointPillars proposes boxes, "
+             "silhouettes and PointNet judge them, and the score is the probability that the"
+             " object is there ([how](../../explanation/fused.md)). Loads and warms up "
+             "before it subscribes. Without weights it reports that in /diagnostics and "
+             "publishes nothing. It warns as pointpillars_detector does. Files: "
+             "`launch/fused.launch.py`, `config/fused.param.yaml`.",
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape. The columns "
                  "`ground`, and for PointPillars `cluster_id`, are used where they are there; what "
                  "is missing is computed, and so are the clusters of people.")],
@@ -172,14 +187,15 @@ PAGES: dict[str, dict[str, Any]] = {
                   "fusion_ms", STRING_TIMES, "Time of each step.")]),
     "tracker": dict(
         params=params.TrackerNodeParams(),
-        what="Follows the detections of any detector: ids that stay, velocities, and scores that "
-             "are the evidence over time, see [tracking](../../explanation/tracking.md). A frame that was lost is "
-             "predicted over with the next one, and has no answer of its own; one that is late, or "
-             "has the stamp of the last one, is not answered; "
-             "time that jumps, as of a bag that is played again, ends all tracks. Warns of "
-             "what is wrong with a frame or the poses. The detector nodes do the same in their "
-             "own process with `tracking.enabled`, then from weak detections too. Files: the "
-             "argument `tracking:=true` of the launch files, `config/tracker.param.yaml`.",
+        what="Turns the detections of any detector into tracks with ids and velocities; "
+             "scores are the evidence over time ([how](../../explanation/tracking.md)). A "
+             "lost frame is predicted over with the next one and gets no message of its own;"
+             " a late frame, and one with the stamp of the last one, get none either. A jump"
+             " in time, as of a bag that starts again, ends all tracks. /diagnostics names "
+             "what is wrong with a frame or the poses. The detector nodes do the same in "
+             "their own process with `tracking.enabled`, then from weak detections too. "
+             "Files: the argument `tracking:=true` of the launch files, "
+             "`config/tracker.param.yaml`.",
         inputs=[("~/input/detections", MARKERS, "CUBEs with `ns` as class, and a score in the text "
                  "as JSON. A frame without any is a DELETE or DELETEALL with its header."),
                 ("~/input/detections_3d", "vision_msgs/Detection3DArray", "Or this, where "
@@ -196,8 +212,8 @@ PAGES: dict[str, dict[str, Any]] = {
         outputs=[]),
     "bag_player": dict(
         params=params.PlayerParams(),
-        what="Replays a rosbag2 bag (MCAP or SQLite3), or one of ROS 1. Messages go from the file "
-             "to DDS as they are. Ends with exit code 0 when the bag is played.",
+        what="Replays a rosbag2 bag (MCAP or SQLite3), or one of ROS 1. Messages go from the"
+             " file to DDS as they are. Ends with exit code 0 when the bag is played.",
         inputs=[],
         outputs=[("the topics of the bag", "as recorded", "With the recorded QoS. Livox "
                   "CustomMsg and CompressedPointCloud2 as PointCloud2."),
@@ -209,7 +225,8 @@ PAGES: dict[str, dict[str, Any]] = {
                    "installed; the parameter `rate` does the same everywhere.")]),
     "bag_recorder": dict(
         params=params.RecorderParams(),
-        what="Records topics to an MCAP bag. The bag appears under its name when the node ends.",
+        what="Records topics to an MCAP bag. The bag appears under its name when the node "
+             "ends.",
         inputs=[("the topics named in topics", "any", "With the QoS of their publishers.")],
         outputs=[]),
 }
@@ -241,11 +258,24 @@ def page(name: str) -> str:
         lines += ["With `tracking.enabled` the node has the topics of the [tracker](tracker.md), "
                   "too; a detector with a network then tracks weak detections as well, from "
                   "`tracking.min_score` on.", ""]
-    lines += ["## Parameters", "", "| name | default | range | |", "|---|---|---|---|"]
-    for key, f in node_parameters(name).items():
-        lines.append(f"| `{key}` | {_default(f)} | {_range(f)} | {f.metadata['doc']}"
-                     + (" Fixed at start." if f.metadata["fixed"] else "") + " |")
+    known = node_parameters(name)
+    first = [key for key in FIRST if key in known][:10] or [*known][:10]
+    rest = [key for key in known if key not in first]
+    lines += ["## Parameters", "", *_parameter_table(known, first)]
+    if rest:
+        summary = f"<summary>{len(rest)} more parameters</summary>"
+        lines += ["", '<details markdown="1">', summary, "", *_parameter_table(known, rest), "",
+                  "</details>"]
     return "\n".join(lines) + "\n"
+
+
+def _parameter_table(known: dict[str, Any], names: list[str]) -> list[str]:
+    rows = ["| name | default | range | |", "|---|---|---|---|"]
+    for key in names:
+        f = known[key]
+        rows.append(f"| `{key}` | {_default(f)} | {_range(f)} | {f.metadata['doc']}"
+                    + (" Fixed at start." if f.metadata["fixed"] else "") + " |")
+    return rows
 
 
 def best() -> str:

@@ -57,7 +57,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         if "://" in target or target.startswith("/"):
             return match[0]
         path = Path(os.path.normpath(folder / target))
-        if path.is_relative_to(DOCS) and path.suffix != ".py" or not path.is_relative_to(ROOT):
+        in_docs = path.is_relative_to(DOCS) and path.suffix != ".py"
+        if in_docs or not path.is_relative_to(ROOT):
             return match[0]
         url = repository()
         return f"[{text}]({url}/blob/main/{path.relative_to(ROOT)}{anchor})" if url else text

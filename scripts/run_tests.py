@@ -1,6 +1,6 @@
 """Run the tests of this checkout: ./lidar test [ARGUMENTS of pytest].
 
-Without arguments: ruff, mypy and all tests. The tests of the core run on all cores, and two more
+Without arguments: ruff, mypy, the documentation site and all tests. The tests of the core run on all cores, and two more
 processes run the tests that mostly wait for other processes. Numba compiles once before them, while
 ruff and mypy run. Coverage must reach the limit in setup.cfg. It is not measured in nodes that run
 in their own processes, nor in long tests that repeat the lines of others, such as those of
@@ -91,6 +91,8 @@ def run_everything(folder: Path) -> list[str]:
     for compiling in [BackgroundCommand("-c", part) for part in parts]:
         compiling.failed()
     BackgroundCommand("-c", last).failed()
+    running["docs"] = BackgroundCommand("-m", "mkdocs", "build", "--strict", "--quiet",
+                                        "--site-dir", str(folder / "site"))
     running["tests of nodes"] = BackgroundCommand(
         *pytest, *_distributed(NODE_WORKERS), *nodes,
         environment={**environment, "COVERAGE_FILE": str(folder / "nodes")})

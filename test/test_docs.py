@@ -39,8 +39,8 @@ def test_every_node_has_a_page():
 
 @pytest.mark.parametrize("name", NODES)
 def test_pages_are_made_from_the_code(generate, name):
-    assert (ROOT / "docs" / "reference" / "nodes" / f"{name}.md").read_text() == generate.page(name), \
-        "run: python docs/generate.py"
+    page = ROOT / "docs" / "reference" / "nodes" / f"{name}.md"
+    assert page.read_text() == generate.page(name), "run: python docs/generate.py"
 
 
 @pytest.mark.parametrize("name", ["ground_segmentation", "clustering", "candidate_refinement",

@@ -1,5 +1,5 @@
-"""docs/how-to/extend.md: each example is carried out in a copy of the package, with what the page says and
-nothing else, and its command runs."""
+"""docs/how-to/extend.md: each example is carried out in a copy of the package, and its command
+runs."""
 
 from __future__ import annotations
 

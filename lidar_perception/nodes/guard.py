@@ -8,8 +8,9 @@ import numpy as np
 from numba import njit, types
 
 REACTION = 5.0  # seconds for the current work; a stuck one is not waited for
-TEARDOWN = 3.0  # seconds for DDS to be taken down, after all is written; cut short, it may leave
-# others a port in shared memory that they wait for (docs/explanation/reliability.md); launch sends SIGTERM at 5
+# Seconds for DDS to be taken down, after all is written. Cut short, it may leave a port in shared
+# memory that others wait for. launch sends SIGTERM after 5 s.
+TEARDOWN = 3.0
 RUNNING, CLOSING, CLOSED = range(3)
 TICK = 0.02  # seconds
 

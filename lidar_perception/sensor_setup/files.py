@@ -66,8 +66,8 @@ def sensor_yaml(m: Measured) -> str:
         values["wander"] = round(float(np.degrees(sensor.wander)), 4)
     if sensor.fade != default.fade:
         values["fade"] = list(sensor.fade)
-    out = _head(m, _origin(m), "Angles in degrees, lengths in metres; docs/how-to/own-sensor.md describes "
-                "every field.") + "\n"
+    out = _head(m, _origin(m), "Angles in degrees, lengths in metres; "
+                "docs/how-to/own-sensor.md describes every field.") + "\n"
     out += "".join(f"{key}: {_plain(value)}" + (f"  # {why[key]}" if key in why else "") + "\n"
                    for key, value in values.items())
     out += _list("elevations", np.degrees(sensor.elevations), 4)

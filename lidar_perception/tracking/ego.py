@@ -114,7 +114,7 @@ class Odometry:
     (Vizzo et al., RA-L 2023). InputError where it is not installed.
 
     It runs in one thread, so that the same scans give the same poses, and registers one point in
-    each COARSE voxels, where that leaves ENOUGH: see docs/how-to/track.md for what both cost and save.
+    each COARSE voxels, where that leaves ENOUGH.
     """
 
     def __init__(self, voxel: float = 1.0) -> None:

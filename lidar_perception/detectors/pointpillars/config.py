@@ -25,7 +25,7 @@ SIZES = {
     # Lang et al., CVPR 2019; paper B: 2C = 64 channels in the new neck
     "full": dict(pillar_channels=64, map_channels=(16, 32, 64), block_channels=(64, 128, 256),
                  block_layers=(3, 5, 5), deconv_channels=128, fpn_channels=64),
-    # the same grid with an eighth of the arithmetic, for two CPU cores; see docs/explanation/pointpillars.md
+    # the same grid with an eighth of the arithmetic, for two CPU cores
     "compact": dict(pillar_channels=16, map_channels=(8, 8), block_channels=(32, 64, 96),
                     block_layers=(1, 3, 3), deconv_channels=32, fpn_channels=32),
 }
