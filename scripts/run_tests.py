@@ -1,10 +1,10 @@
 """Run the tests of this checkout: ./lidar test [ARGUMENTS of pytest].
 
-Without arguments: ruff, mypy, the documentation site and all tests. The tests of the core run on all cores, and two more
-processes run the tests that mostly wait for other processes. Numba compiles once before them, while
-ruff and mypy run. Coverage must reach the limit in setup.cfg. It is not measured in nodes that run
-in their own processes, nor in long tests that repeat the lines of others, such as those of
-Hypothesis, because measuring doubles their time.
+Without arguments: ruff, mypy, the documentation site and all tests. The tests of the core run on
+all cores, and two more processes run the tests that mostly wait for other processes. Numba compiles
+once before them, while ruff and mypy run. Coverage must reach the limit in setup.cfg. It is not
+measured in nodes that run in their own processes, nor in long tests that repeat the lines of
+others, such as those of Hypothesis, because measuring doubles their time.
 
     ./lidar test
     ./lidar test -k clustering -x
