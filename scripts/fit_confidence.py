@@ -29,7 +29,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.groups import group_points
 from lidar_perception.runs.files import write_text
 from lidar_perception.scoring.centres.matching import match_centres, range_bins
-from lidar_perception.training.curves import fit
+from lidar_perception.training.curves import fit_curves
 from lidar_perception.types import PEDESTRIAN, InputError
 
 KITTI_RANGES = np.array([2093, 1771, 468, 118, 37])  # paper A, Table 1
@@ -96,8 +96,8 @@ def main(roots: list[str]) -> None:
     models = {
         "trained_on": {"frames": len(frames), "clusters": len(hit), "pedestrians": int(hit.sum()),
                        "of": int(truth.sum()), "weights_by_range": share.round(2).tolist()},
-        "shape": fit(features, hit, weight, SHAPE_KNOTS),
-        "seed": fit(features, hit, weight, {**SHAPE_KNOTS, **SEED_KNOTS}, RISING),
+        "shape": fit_curves(features, hit, weight, SHAPE_KNOTS),
+        "seed": fit_curves(features, hit, weight, {**SHAPE_KNOTS, **SEED_KNOTS}, RISING),
     }
     write_text(OUT, json.dumps(models, indent=1))
     print(OUT, models["trained_on"])

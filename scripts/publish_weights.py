@@ -37,7 +37,7 @@ from lidar_perception.runs.terminal import console
 from lidar_perception.scoring.detections import by_detector
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.scoring.run import fill
-from lidar_perception.training.record import metrics_of, rounded
+from lidar_perception.training.record import round_metrics, select_metrics
 
 ROWS = (("bev_relaxed", "from above"), ("bev", "from above"), ("3d_relaxed", "in space"),
         ("3d", "in space"))
@@ -117,8 +117,8 @@ def main(weights: Path, folders: tuple[Path, ...], before: Path | None, judge: b
     save_checkpoint(out, network, header, half=True)
     scored = {folder.name: scores_of(out, folder) for folder in folders}
     if before is not None:  # the header has what the first folder says of the mean
-        metrics = metrics_of(scored[folders[0].name], "bev", header.config.classes)
-        save_checkpoint(out, network, replace(header, metrics=rounded(metrics)), half=True)
+        metrics = select_metrics(scored[folders[0].name], "bev", header.config.classes)
+        save_checkpoint(out, network, replace(header, metrics=round_metrics(metrics)), half=True)
     write_text(out.with_suffix(".md"), card(header, out.stem, scored))
     console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB")
 

@@ -188,8 +188,8 @@ def test_a_network_knows_no_other(name):
 
 
 SHARED_TRAINING = [f"lidar_perception/training/{name}.py" for name in (
-    "schedule", "ranks", "log", "run", "loop", "augment", "putting", "database", "data")]
-
+    "schedule", "distributed", "log", "run", "run_directory", "loop", "plan", "planning", "start",
+    "trainer", "augment", "pasting", "database", "data")]
 
 @for_all(SHARED_TRAINING)
 def test_what_all_networks_train_with_knows_none_of_them(name):

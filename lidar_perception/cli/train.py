@@ -24,8 +24,8 @@ from lidar_perception.cli.data import (
 from lidar_perception.cli.options import checked, device_option, parameter_options
 from lidar_perception.param_fields import parameter_fields
 from lidar_perception.runs.terminal import console
-from lidar_perception.training.asked import Asked
 from lidar_perception.training.params import FusedTraining, PointNetTraining, PointPillarsTraining
+from lidar_perception.training.request import TrainingRequest
 from lidar_perception.types import InputError
 
 OPTIONS = (
@@ -51,11 +51,11 @@ OPTIONS = (
 
 
 def shared_options(function: Callable) -> Callable:
-    """Decorator: the options that all networks share, which the function gets as asked=Asked()."""
+    """Decorate a command with the options of all networks; it gets them as request=..."""
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
-        asked = Asked(**{f.name: kwargs.pop(f.name) for f in fields(Asked)})
-        return function(*args, asked=asked, **kwargs)
+        request = TrainingRequest(**{f.name: kwargs.pop(f.name) for f in fields(TrainingRequest)})
+        return function(*args, request=request, **kwargs)
 
     for option in reversed(OPTIONS):
         wrapper = option(wrapper)
@@ -101,7 +101,7 @@ def train() -> None:
 @train.command()
 @shared_options
 @training_options(PointPillarsTraining())
-def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
+def pointpillars(request: TrainingRequest, params: PointPillarsTraining) -> None:
     """Train PointPillars or EG-PointPillars on labelled frames, simulated streets, or both.
 
     Scans, steps and validations are chosen so that all ends within --budget hours on this machine.
@@ -119,16 +119,16 @@ def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
           --size full --budget 12 --out v4
     """
     from lidar_perception.detectors.pointpillars.config import RANGES, network_config
-    from lidar_perception.training.pointpillars.start import PointPillarsStart
+    from lidar_perception.training.pointpillars.trainer import PointPillarsTrainer
     seen: dict[str, Any] = {**RANGES["around"]} if params.range == "around" else {}
     config = network_config(params.version, params.size, **seen)  # a size by itself sees ahead
-    run(PointPillarsStart(config), asked, params)
+    run(PointPillarsTrainer(config), request, params)
 
 
 @train.command()
 @shared_options
 @training_options(PointNetTraining())
-def pointnet(asked: Asked, params: PointNetTraining) -> None:
+def pointnet(request: TrainingRequest, params: PointNetTraining) -> None:
     """Train the cluster network (PointNet) on labelled frames, simulated streets, or both.
 
     Scenes are cut into clusters by the package's own ground and clustering. Scans and steps are
@@ -144,9 +144,9 @@ def pointnet(asked: Asked, params: PointNetTraining) -> None:
           --val-split val.txt --epochs 20 --out pointnet --resume
     """
     from lidar_perception.detectors.pointnet.config import pointnet_config
-    from lidar_perception.training.pointnet.start import PointNetStart, proposer_of
-    proposer_of(params)  # InputError before anything is made
-    run(PointNetStart(pointnet_config(params.network)), asked, params)
+    from lidar_perception.training.pointnet.trainer import PointNetTrainer, find_proposer
+    find_proposer(params)  # raises InputError before anything is made
+    run(PointNetTrainer(pointnet_config(params.network)), request, params)
 
 
 @train.command()
@@ -182,42 +182,41 @@ def fused(weights: Path | None, classifier: Path | None, out: Path, force: bool,
         raise InputError(f"--out {out} must end with {SUFFIX}")
     if out.exists() and not force:
         raise InputError(f"{out} exists already; give another name, or --force")
-    from lidar_perception.training.fusing import fuse
-    judged = fuse(weights, classifier, out, params, jobs)
-    print_fused(judged)
+    from lidar_perception.training.fusion_curves import fit_fusion
+    print_fused(fit_fusion(weights, classifier, out, params, jobs))
     console.print(f"{out}: --weights of commands, and fused.weights of the node, take it")
 
 
-def run(network: Any, asked: Asked, params: Any) -> None:
-    """Train, and say how it ended."""
-    from lidar_perception.training.start import start
-    ended = start(network, asked, params, commit())
-    if ended is not None:
-        tell(*ended, asked.out)
+def run(trainer: Any, request: TrainingRequest, params: Any) -> None:
+    """Train, and print the result."""
+    from lidar_perception.training.start import start_training
+    result = start_training(trainer, request, params, commit())
+    if result is not None:
+        print_result(*result, request.out)
 
 
-def print_fused(judged: Any) -> None:
-    """How the curves do, by class."""
+def print_fused(fits: Any) -> None:
+    """Print the fit of each class."""
     from lidar_perception.scoring.tables import narrow_table
     table = narrow_table("Curves, on scans that they were not fitted to", "", "proposals", "right",
                          ">= 0.4", "right", "log loss")
     few = []
-    for name, own in judged.items():
+    for name, own in fits.items():
         rows = [("package", own.before)]
         rows += [("fitted", own.after)] if own.after else []
         few += [] if own.after else [name]
-        for k, (which, said) in enumerate(rows):
+        for k, (which, score) in enumerate(rows):
             table.add_row(f"{name}, {which}", *(
                 (str(own.proposals), str(own.right)) if k == 0 else ("", "")),
-                str(said.right + said.wrong), str(said.right), f"{said.loss:.3f}")
+                str(score.right + score.wrong), str(score.right), f"{score.loss:.3f}")
     console.print(table)
     if few:
         console.print(f"{', '.join(few)}: too few to fit curves to; those of the package stay. "
                       "More --scans, or another --scene, have more")
 
 
-def tell(progress: Any, steps: int, batches: Any, out: Path) -> None:
-    """Say how a run ended; a stopped one ends the process."""
+def print_result(progress: Any, steps: int, batches: Any, out: Path) -> None:
+    """Print how a run ended. A run that was stopped ends the process with code 130."""
     if batches.skipped:
         console.print(f"{len(batches.skipped)} scenes could not be used, such as: "
                       f"{next(iter(batches.skipped))}")
@@ -232,14 +231,14 @@ def tell(progress: Any, steps: int, batches: Any, out: Path) -> None:
     if progress.late:
         console.print("the budget is spent and the learning rate has not come down: "
                       f"{steps - progress.step - progress.left_out:.0f} of {steps} steps are "
-                      "missing; --resume goes on")
+                      "missing; continue with --resume")
     if progress.stopped:
-        console.print(f"stopped at step {progress.step}; --resume resumes it")
+        console.print(f"stopped at step {progress.step}; continue with --resume")
         sys.exit(130)
 
 
 def commit() -> str:
-    """The commit of this checkout, with + if files differ from it; the version if it is none."""
+    """Return the commit of this checkout, with + if files are changed, or else the version."""
     folder = Path(__file__).resolve().parents[2]
     try:
         head, changes = (subprocess.run(["git", "-C", str(folder), *words], capture_output=True,

@@ -1,1 +1,1 @@
-"""Training: one loop for every network of the package, and what each network brings to it."""
+"""Training: one loop for every network of the package, and a trainer for each network."""

@@ -1,7 +1,7 @@
-"""Changes of labelled scenes that a detector should not mind; pure, with the rng given.
+"""Augmentation of labelled scenes: pure functions with the random generator as an argument.
 
-But for noise and slopes, points in a box stay in it. A scene is a cloud with its boxes, in the
-frame of a level sensor.
+Apart from noise and slopes, points in a box stay in it. A scene is a cloud with boxes in the frame
+of a level sensor.
 """
 
 from __future__ import annotations
@@ -13,19 +13,26 @@ from numpy.typing import ArrayLike
 
 from lidar_perception.geometry import bev_iou, elevations, to_box_frame, within, wrap_angle
 from lidar_perception.training.params import AugmentParams, NoiseParams, ThingParams
-from lidar_perception.training.putting import TOUCH, inside
+from lidar_perception.training.pasting import MIN_RANGE_M, find_points_in_box
 from lidar_perception.types import SENSOR_HEIGHT
 
-STEP = np.radians(0.4)  # of elevation between two beams
-SHINING = 0.99  # intensity of a reflector
-BORDER = 0.01  # m: points so near to a box are taken for its own, as labels are rounded
+BEAM_STEP = np.radians(0.4)  # elevation between two beams
+REFLECTOR_INTENSITY = 0.99
+BOX_MARGIN_M = 0.01  # points this near to a box belong to it, since labels are rounded
 
 
 @dataclass(frozen=True)
 class TrainingScene:
-    """points (N, 4) float32 [x y z intensity]; boxes (M, 7) float64 [x y z l w h yaw], class_ids
-    (M,) int into CLASSES. wanted (M,) bool: not so hidden that nobody would label it. around: the
-    labels are all around, not ahead only. height: of the sensor above the ground, metres."""
+    """A labelled scene.
+
+    Attributes:
+        points: (N, 4) float32, x y z intensity.
+        boxes: (M, 7) float64, x y z l w h yaw.
+        class_ids: (M,) int into CLASSES.
+        wanted: (M,) bool, False for objects too hidden to be labelled.
+        around: The labels are all around, not only ahead.
+        height: Height of the sensor above the ground in metres.
+    """
 
     points: np.ndarray
     boxes: np.ndarray
@@ -35,51 +42,53 @@ class TrainingScene:
     height: float = SENSOR_HEIGHT
 
 
-def augmented(scene: TrainingScene, params: AugmentParams,
-              rng: np.random.Generator) -> TrainingScene:
-    """All changes but the turn and the objects of other scenes, see database.with_objects."""
-    scene = with_moved_objects(scene, params.object_turn, params.object_shift, rng)
+def augment_scene(scene: TrainingScene, params: AugmentParams,
+                  rng: np.random.Generator) -> TrainingScene:
+    """Apply every change except those of turn_and_crop and database.paste_objects."""
+    scene = move_objects(scene, params.object_turn, params.object_shift, rng)
     if rng.random() < params.flip:
-        scene = flipped(scene)
-    scene = replace(scene, points=noisy(scene.points, params, rng))
-    scene = scaled(scene, 1 + rng.uniform(-params.scale, params.scale))
-    scene = thinned(scene, rng.uniform(0, params.dropout), rng)
-    scene = brightened(scene, 1 + rng.uniform(-params.intensity, params.intensity),
-                       rng.uniform(-params.intensity, params.intensity) / 2)
-    return raised(scene, rng.uniform(-params.height, params.height),
-                  rng.uniform(-params.tilt, params.tilt, 2))
+        scene = flip_scene(scene)
+    scene = replace(scene, points=add_range_noise(scene.points, params, rng))
+    scene = scale_scene(scene, 1 + rng.uniform(-params.scale, params.scale))
+    scene = drop_points(scene, rng.uniform(0, params.dropout), rng)
+    scene = change_intensity(scene, 1 + rng.uniform(-params.intensity, params.intensity),
+                             rng.uniform(-params.intensity, params.intensity) / 2)
+    return raise_scene(scene, rng.uniform(-params.height, params.height),
+                       rng.uniform(-params.tilt, params.tilt, 2))
 
 
-def faced(scene: TrainingScene, params: AugmentParams, low: np.ndarray, high: np.ndarray,
-          rng: np.random.Generator) -> TrainingScene:
-    """The scene turned, and what can come between low and high (3,) by all other changes, metres:
-    first, since most of a scan lies elsewhere."""
+def turn_and_crop(scene: TrainingScene, params: AugmentParams, low: np.ndarray, high: np.ndarray,
+                  rng: np.random.Generator) -> TrainingScene:
+    """Turn the scene, and keep what the other changes can move between low and high (3,), in m.
+
+    Done first, since most of a scan is elsewhere.
+    """
     turn = np.pi if scene.around and params.turn else params.turn
-    scene = turned(scene, rng.uniform(-turn, turn))
+    scene = turn_scene(scene, rng.uniform(-turn, turn))
     margin = 1 + params.height + params.scale / (1 - params.scale) * np.abs([low, high])
     margin[:, 2] += 2 * params.tilt * np.abs([low[:2], high[:2]]).max()
-    return cropped(scene, low - margin[0], high + margin[1])
+    return crop_scene(scene, low - margin[0], high + margin[1])
 
 
-def cropped(scene: TrainingScene, low: np.ndarray, high: np.ndarray) -> TrainingScene:
-    """The points between low and high (3,), and the boxes whose centre is, seen from above."""
+def crop_scene(scene: TrainingScene, low: np.ndarray, high: np.ndarray) -> TrainingScene:
+    """Keep points between low and high (3,), and boxes whose centre is, seen from above."""
     kept = np.ones(len(scene.points), bool)
     for axis in range(3):
         kept &= (scene.points[:, axis] >= low[axis]) & (scene.points[:, axis] < high[axis])
-    here = within(scene.boxes, low, high)
-    return replace(scene, points=scene.points[kept], boxes=scene.boxes[here],
-                   class_ids=scene.class_ids[here], wanted=scene.wanted[here])
+    inside = within(scene.boxes, low, high)
+    return replace(scene, points=scene.points[kept], boxes=scene.boxes[inside],
+                   class_ids=scene.class_ids[inside], wanted=scene.wanted[inside])
 
 
-def flipped(scene: TrainingScene) -> TrainingScene:
-    """Left and right swapped."""
+def flip_scene(scene: TrainingScene) -> TrainingScene:
+    """Swap left and right."""
     points = scene.points * np.array([1, -1, 1, 1], np.float32)
     boxes = scene.boxes * [1, -1, 1, 1, 1, 1, -1]
     return replace(scene, points=points, boxes=boxes)
 
 
-def turned(scene: TrainingScene, angle: float) -> TrainingScene:
-    """Turned about the sensor, counter-clockwise."""
+def turn_scene(scene: TrainingScene, angle: float) -> TrainingScene:
+    """Turn the scene counter-clockwise about the sensor, in rad."""
     cos, sin = np.cos(angle), np.sin(angle)
     matrix = np.array([[cos, sin], [-sin, cos]])
     points, boxes = scene.points.copy(), scene.boxes.copy()
@@ -89,43 +98,51 @@ def turned(scene: TrainingScene, angle: float) -> TrainingScene:
     return replace(scene, points=points, boxes=boxes)
 
 
-def scaled(scene: TrainingScene, factor: float) -> TrainingScene:
-    """Every length times factor."""
+def scale_scene(scene: TrainingScene, factor: float) -> TrainingScene:
+    """Multiply every length by factor."""
     points, boxes = scene.points.copy(), scene.boxes.copy()
     points[:, :3] *= np.float32(factor)
     boxes[:, :6] *= factor
     return replace(scene, points=points, boxes=boxes)
 
 
-def thinned(scene: TrainingScene, share: float, rng: np.random.Generator) -> TrainingScene:
-    """About this share of the points left out."""
+def drop_points(scene: TrainingScene, share: float, rng: np.random.Generator) -> TrainingScene:
+    """Drop about this share of the points, at random."""
     return replace(scene, points=scene.points[rng.random(len(scene.points)) >= share])
 
 
-def brightened(scene: TrainingScene, factor: float, offset: float) -> TrainingScene:
-    """Intensities times factor, plus offset, within 0 .. 1. Those of 0 stay: that is what sensors
-    report of the weakest returns, however bright the others are."""
+def change_intensity(scene: TrainingScene, factor: float, offset: float) -> TrainingScene:
+    """Multiply intensities by factor and add offset, clipped to 0 .. 1.
+
+    An intensity of 0 stays 0: sensors report it for the weakest returns, at any scale.
+    """
     points = scene.points.copy()
-    read = points[:, 3] > 0
-    points[read, 3] = np.clip(points[read, 3] * factor + offset, 0, 1)
+    positive = points[:, 3] > 0
+    points[positive, 3] = np.clip(points[positive, 3] * factor + offset, 0, 1)
     return replace(scene, points=points)
 
 
-def with_reflector(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Points (N, 4) of one thing, N at least 1, of which those between two heights shine."""
+def add_reflector(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Make a random range of heights of one thing retroreflective. points: (N, 4), N >= 1."""
     points = points.copy()
     height = points[:, 2]
     low, high = np.sort(rng.uniform(height.min(), height.max(), 2))
-    points[(height >= low) & (height <= high), 3] = SHINING
+    points[(height >= low) & (height <= high), 3] = REFLECTOR_INTENSITY
     return points
 
 
-def varied(points: np.ndarray, foot: np.ndarray, params: ThingParams,
-           rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 4) of one thing, N at least 1, that is wider, higher and brighter, or less so, and
-    the factors (3,) of its lengths about its foot (3,): up to exp(things_stretch) or its inverse,
-    the same along x and y; intensities likewise by things_intensity. With the chance things_shine
-    it shines between two heights."""
+def vary_thing(points: np.ndarray, foot: np.ndarray, params: ThingParams,
+               rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Stretch one background thing about its foot and change its intensity, at random.
+
+    Args:
+        points: (N, 4) points of the thing, N >= 1.
+        foot: (3,) point on the ground that stays where it is.
+        params: Limits; width and height change by factors up to exp(things_stretch).
+
+    Returns:
+        (N, 4) changed points, and the (3,) factors of the lengths, equal along x and y.
+    """
     wide, high = np.exp(rng.uniform(-params.things_stretch, params.things_stretch, 2))
     factors = np.array([wide, wide, high])
     points = points.copy()
@@ -133,25 +150,31 @@ def varied(points: np.ndarray, foot: np.ndarray, params: ThingParams,
     factor = np.exp(rng.uniform(-params.things_intensity, params.things_intensity))
     points[:, 3] = np.clip(points[:, 3] * factor, 0, 1)
     if rng.random() < params.things_shine:
-        points = with_reflector(points, rng)
+        points = add_reflector(points, rng)
     return points, factors
 
 
-def noisy(points: np.ndarray, params: NoiseParams, rng: np.random.Generator) -> np.ndarray:
-    """Points (N, 4) blurred by up to what params say."""
-    return blurred(points, rng.uniform(0, params.beam_noise), rng.uniform(0, params.range_noise),
-                   rng)
+def add_range_noise(points: np.ndarray, params: NoiseParams,
+                    rng: np.random.Generator) -> np.ndarray:
+    """Shift points (N, 4) along their rays by random errors within the limits of params."""
+    return blur_ranges(points, rng.uniform(0, params.beam_noise),
+                       rng.uniform(0, params.range_noise), rng)
 
 
-def blurred(points: np.ndarray, beam: float, point: float, rng: np.random.Generator) -> np.ndarray:
-    """Points (N, 4) nearer or farther along their rays, metres: by what all points of an elevation,
-    to STEP, have in common, and by something of its own; standard deviations.
+def blur_ranges(points: np.ndarray, beam: float, point: float,
+                rng: np.random.Generator) -> np.ndarray:
+    """Shift points (N, 4) along their rays by an error of their beam and one of each point.
 
     Real beams do not agree: on KITTI the points of one pole scatter by 0.07 to 0.1 m in depth, the
-    means of its beams by 0.035 to 0.07; a pole that was simulated is as thin as it is.
+    means of its beams by 0.035 to 0.07 m. A simulated pole has no such scatter.
+
+    Args:
+        points: (N, 4) points.
+        beam: Standard deviation in metres of the error that all points of an elevation share.
+        point: Standard deviation in metres of each point's own error.
     """
-    ranges = np.maximum(np.linalg.norm(points[:, :3], axis=1), TOUCH)
-    beams = np.floor(elevations(points) / STEP).astype(np.int64)
+    ranges = np.maximum(np.linalg.norm(points[:, :3], axis=1), MIN_RANGE_M)
+    beams = np.floor(elevations(points) / BEAM_STEP).astype(np.int64)
     first = beams.min(initial=0)
     offsets = rng.normal(0, beam, int(beams.max(initial=0) - first) + 1)
     shift = offsets[beams - first] + rng.normal(0, point, len(points))
@@ -160,45 +183,55 @@ def blurred(points: np.ndarray, beam: float, point: float, rng: np.random.Genera
     return moved
 
 
-def raised(scene: TrainingScene, height: float,
-           slopes: ArrayLike = (0.0, 0.0)) -> TrainingScene:
-    """As from a sensor mounted lower by height, metres, on ground that rises by slopes, along x and
-    y (2,). Boxes stay upright, so that points in a box stay in it if the slopes are 0."""
+def raise_scene(scene: TrainingScene, height: float,
+                slopes: ArrayLike = (0.0, 0.0)) -> TrainingScene:
+    """Raise the scene, as if the sensor were lower, and slope the ground.
+
+    Boxes stay upright, so points may leave their box if the slopes are not 0.
+
+    Args:
+        height: Metres to raise the scene.
+        slopes: Rise of the ground along x and y (2,), m/m.
+    """
     points, boxes = scene.points.copy(), scene.boxes.copy()
     points[:, 2] += (height + scene.points[:, :2] @ np.asarray(slopes)).astype(np.float32)
     boxes[:, 2] += height + scene.boxes[:, :2] @ np.asarray(slopes)
     return replace(scene, points=points, boxes=boxes)
 
 
-def with_moved_objects(scene: TrainingScene, turn: float, shift: float,
-                       rng: np.random.Generator) -> TrainingScene:
-    """Each object, with its points, turned about its middle by up to `turn` and shifted along x and
-    y by about `shift`; not where it would touch another one, nor if it touches one already."""
+def move_objects(scene: TrainingScene, turn: float, shift: float,
+                 rng: np.random.Generator) -> TrainingScene:
+    """Turn and shift each object with its points, unless it touches another or would.
+
+    Args:
+        turn: Largest angle about the object's centre, rad.
+        shift: Standard deviation of the shift along x and along y, metres.
+    """
     points, boxes = scene.points.copy(), scene.boxes.copy()
     if not (turn or shift):
         return scene
     angles = rng.uniform(-turn, turn, len(boxes))
-    ways = rng.normal(0, shift, (len(boxes), 2)) if shift else np.zeros((len(boxes), 2))
+    shifts = rng.normal(0, shift, (len(boxes), 2)) if shift else np.zeros((len(boxes), 2))
     for i in range(len(boxes)):
-        others = np.delete(grown(boxes), i, axis=0)
+        others = np.delete(enlarge_boxes(boxes), i, axis=0)
         goal = boxes[i].copy()
-        goal[:2] += ways[i]
+        goal[:2] += shifts[i]
         goal[6] = wrap_angle(goal[6] + angles[i])
-        if bev_iou(grown(np.stack([boxes[i], goal])), others).any():
+        if bev_iou(enlarge_boxes(np.stack([boxes[i], goal])), others).any():
             continue
-        own = inside(points, boxes[i], BORDER)
-        points[own, :3] = carried(points[own, :3], boxes[i], goal)
+        own = find_points_in_box(points, boxes[i], BOX_MARGIN_M)
+        points[own, :3] = move_with_box(points[own, :3], boxes[i], goal)
         boxes[i] = goal
     return replace(scene, points=points, boxes=boxes)
 
 
-def carried(xyz: np.ndarray, box: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """Points (N, 3) that move with a box (7,) to another place and heading; float32."""
+def move_with_box(xyz: np.ndarray, box: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Return points (N, 3), float32, moved like a box (7,) that moves to the pose of goal (7,)."""
     relative = to_box_frame(xyz.astype(np.float64), box)
     about = np.array([0.0, 0, 0, 0, 0, 0, -goal[6]])
     return (to_box_frame(relative, about) + goal[:3]).astype(np.float32)
 
 
-def grown(boxes: np.ndarray, margin: float = BORDER) -> np.ndarray:
-    """Boxes (M, 7) with a margin on every side."""
+def enlarge_boxes(boxes: np.ndarray, margin: float = BOX_MARGIN_M) -> np.ndarray:
+    """Return boxes (M, 7) with a margin on every side, in metres."""
     return boxes + [0, 0, 0, 2 * margin, 2 * margin, 2 * margin, 0]

@@ -1,4 +1,4 @@
-"""Additive models of log-odds, as candidates/curves.py reads them, fitted to samples."""
+"""Fitting of additive models of log-odds, as candidates/curves.py reads them, to samples."""
 
 from __future__ import annotations
 
@@ -8,25 +8,37 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
-PENALTY = 1.0  # chosen on streets left out
+PENALTY = 1.0  # chosen on held-out streets
 
 
-def ramps(values: np.ndarray, knots: tuple[float, ...]) -> np.ndarray:
-    """(K, len(knots) - 1) how far each of K values has come from one knot to the next, 0..1; NaN
-    has not begun."""
+def compute_ramps(values: np.ndarray, knots: tuple[float, ...]) -> np.ndarray:
+    """Return how far each value (K,) is from one knot to the next: (K, len(knots) - 1), 0 .. 1.
+
+    NaN values give 0.
+    """
     low, high = np.array(knots[:-1]), np.array(knots[1:])
     return np.nan_to_num(np.clip((values[:, None] - low) / (high - low), 0.0, 1.0))
 
 
-def fit(features: Mapping[str, np.ndarray], hit: np.ndarray, weight: np.ndarray,
-        knots: Mapping[str, tuple[float, ...]], rising: Mapping[str, int] = {}) -> dict:
-    """The model of samples with features (K,), by name, hit (K,) bool and weights (K,): logistic
-    regression on the steps from knot to knot, and one for NaN where there is any. The penalty on
-    them keeps curves level where there is nothing to learn from. rising: features whose curves
-    never fall, 1, or never rise, -1."""
+def fit_curves(features: Mapping[str, np.ndarray], hit: np.ndarray, weight: np.ndarray,
+               knots: Mapping[str, tuple[float, ...]], rising: Mapping[str, int] = {}) -> dict:
+    """Fit one curve to each feature, by penalised logistic regression on its steps between knots.
+
+    The penalty keeps curves level where samples are missing.
+
+    Args:
+        features: Values (K,) by name. One extra step stands for NaN values.
+        hit: (K,) bool, the outcome.
+        weight: (K,) weights of the samples.
+        knots: Knots of each feature's curve.
+        rising: 1 for features whose curve must not fall, -1 for those that must not rise.
+
+    Returns:
+        The model as JSON data: "bias", and "curves" by feature.
+    """
     columns, bounds, parts = [], [], []
     for name, own in knots.items():
-        steps, unknown = ramps(features[name], own), np.isnan(features[name])[:, None]
+        steps, unknown = compute_ramps(features[name], own), np.isnan(features[name])[:, None]
         direction = rising.get(name, 0)
         columns.append(np.column_stack([steps, unknown]) if unknown.any() else steps)
         bounds += [{1: (0, None), -1: (None, 0), 0: (None, None)}[direction]] * steps.shape[1]

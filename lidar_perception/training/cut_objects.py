@@ -1,5 +1,7 @@
-"""What scenes give to others: labelled objects, and what stands upright like a person and is none
-(posts, poles, trunks, bins), to be learned from as often as people are."""
+"""Objects cut from scenes for pasting: labelled ones, and things that resemble a standing person.
+
+Such things (posts, poles, trunks, bins) are pasted as background as often as people.
+"""
 
 from __future__ import annotations
 
@@ -17,23 +19,30 @@ from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EX
 from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import segment_ground
-from lidar_perception.training.augment import TrainingScene, grown
-from lidar_perception.training.cache import kept, path_in
+from lidar_perception.training.augment import TrainingScene, enlarge_boxes
+from lidar_perception.training.cache import cache_path, load_or_make
 from lidar_perception.training.database import THING, Database
-from lidar_perception.training.putting import inside
+from lidar_perception.training.pasting import find_points_in_box
 from lidar_perception.types import CLASSES, PEDESTRIAN, LidarFrame
 
-WIDEST = 1.2          # m to a side
-HEIGHTS = 0.6, 4.5    # m of its top above the ground
-MAX_GAP = 0.8        # m between the ground and the lowest point
-APART = 0.3           # m from every labelled box
-MOST = 20             # of a scene
+# A thing resembles a standing person if
+MAX_WIDTH_M = 1.2                # its sides are at most this long,
+MIN_TOP_M, MAX_TOP_M = 0.6, 4.5  # its top is this high above the ground,
+MAX_GAP_M = 0.8                  # its lowest point is this near to the ground,
+MIN_DISTANCE_M = 0.3             # and every labelled box is farther away.
+MAX_THINGS = 20                  # from a scene
 
 
 @dataclass(frozen=True)
 class CutObjects:
-    """scene(i): what scene i of `scenes` gives to others, see cut. cache: folder for that, or
-    None."""
+    """A source whose scene(i) is the Database of objects cut from scene i, see cut_objects.
+
+    Attributes:
+        scenes: Source of scenes.
+        classes: Names of the classes to cut.
+        min_points: Objects with fewer points are left out.
+        cache: Folder that keeps the objects, or None.
+    """
 
     scenes: Any
     classes: tuple[str, ...]
@@ -44,45 +53,49 @@ class CutObjects:
         return len(self.scenes)
 
     def path(self, i: int) -> Path | None:
-        """The file that keeps it."""
-        return path_in(self.cache, self.scenes.key(i), self.classes, self.min_points)
+        """Return the cache file of scene i."""
+        return cache_path(self.cache, self.scenes.key(i), self.classes, self.min_points)
 
     def keep(self, i: int) -> None:
-        """Put it into the cache."""
+        """Put the objects of scene i into the cache."""
         self.scene(i)
 
     def scene(self, i: int) -> Database:
-        """InputError naming the file that cannot be used."""
-        return kept(self.path(i),
-                    lambda: cut(self.scenes.scene(i), self.classes, self.min_points, i),
-                    lambda arrays: Database(**arrays), vars)
+        """Return the objects of scene i. Raise InputError, naming the file, for a broken scene."""
+        return load_or_make(
+            self.path(i),
+            lambda: cut_objects(self.scenes.scene(i), self.classes, self.min_points, i),
+            lambda arrays: Database(**arrays), vars)
 
 
-def cut(scene: TrainingScene, classes: tuple[str, ...], min_points: int, seed: int = 0) -> Database:
-    """The wanted objects of some classes that have enough points; where boxes overlap, none. If
-    people are among them, things that look like people, too; which of many, the seed draws."""
+def cut_objects(scene: TrainingScene, classes: tuple[str, ...], min_points: int,
+                seed: int = 0) -> Database:
+    """Cut the wanted objects of some classes that have min_points and overlap no other box.
+
+    With pedestrians also things that resemble people, see find_things. The seed draws among many.
+    """
     chosen = [CLASSES.index(name) for name in classes]
     overlap = bev_iou(scene.boxes, scene.boxes) > 0
-    alone = overlap.sum(axis=1) <= 1
+    isolated = overlap.sum(axis=1) <= 1
     boxes, class_ids, points = [np.zeros((0, 7))], [], [np.zeros((0, 4), np.float32)]
-    for i in np.flatnonzero(scene.wanted & alone & np.isin(scene.class_ids, chosen)):
-        own = scene.points[inside(scene.points, scene.boxes[i], 0.0)]
+    for i in np.flatnonzero(scene.wanted & isolated & np.isin(scene.class_ids, chosen)):
+        own = scene.points[find_points_in_box(scene.points, scene.boxes[i], 0.0)]
         if len(own) >= min_points:
             boxes.append(scene.boxes[i:i + 1])
             class_ids.append(scene.class_ids[i])
             points.append(own)
     if PEDESTRIAN in chosen:
-        things, of_things = things_in(scene, min_points, np.random.default_rng(seed))
+        things, thing_points = find_things(scene, min_points, np.random.default_rng(seed))
         boxes.append(things)
         class_ids.extend([THING] * len(things))
-        points.extend(of_things)
+        points.extend(thing_points)
     sizes = [len(own) for own in points[1:]]
     return Database(np.concatenate(boxes), np.array(class_ids, np.int32), np.concatenate(points),
                     np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64))
 
 
-def joined(parts: Sequence[Database]) -> Database:
-    """All objects of some databases; with none of them, none."""
+def join_databases(parts: Sequence[Database]) -> Database:
+    """Return one database with the objects of all parts, empty without any."""
     parts = [Database(np.zeros((0, 7)), np.zeros(0, np.int32), np.zeros((0, 4), np.float32),
                       np.zeros(1, np.int64)), *parts]
     ends = np.cumsum([part.first[-1] for part in parts])
@@ -92,11 +105,18 @@ def joined(parts: Sequence[Database]) -> Database:
                     np.concatenate([part.points for part in parts]), np.concatenate(first))
 
 
-def things_in(scene: TrainingScene, min_points: int,
-              rng: np.random.Generator) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Boxes (K, 7) float64, from the ground up along the axes, and the points (N, 4) of each: the
-    clusters of obstacles of a person's width with so many points that touch no box of the scene; at
-    most MOST, drawn by rng."""
+def find_things(scene: TrainingScene, min_points: int,
+                rng: np.random.Generator) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Find clusters that resemble a standing person and touch no labelled box.
+
+    Args:
+        scene: The scene.
+        min_points: Smallest number of points of a thing.
+        rng: Draws MAX_THINGS if there are more.
+
+    Returns:
+        Boxes (K, 7) float64, along the axes and from the ground up, and the points (N, 4) of each.
+    """
     xyz = np.ascontiguousarray(scene.points[:, :3])
     ground = segment_ground(LidarFrame(xyz), replace(
         EXPERT_GROUND, sensor_pose=SensorPoseParams(height=scene.height)))
@@ -108,10 +128,11 @@ def things_in(scene: TrainingScene, min_points: int,
     floor = ground_under(xyz[ground], boxes[:, :2])
     boxes[:, 5] = high[:, 2] - floor
     boxes[:, 2] = floor + boxes[:, 5] / 2
-    kept = ((sizes >= min_points) & (boxes[:, 3:5].max(axis=1, initial=0) <= WIDEST)
-            & (boxes[:, 5] >= HEIGHTS[0]) & (boxes[:, 5] <= HEIGHTS[1])
-            & (low[:, 2] - floor <= MAX_GAP))
+    kept = ((sizes >= min_points) & (boxes[:, 3:5].max(axis=1, initial=0) <= MAX_WIDTH_M)
+            & (boxes[:, 5] >= MIN_TOP_M) & (boxes[:, 5] <= MAX_TOP_M)
+            & (low[:, 2] - floor <= MAX_GAP_M))
     kept = np.flatnonzero(kept)
-    kept = kept[~bev_iou(grown(boxes[kept]), grown(scene.boxes, APART)).any(axis=1)]
-    kept = rng.permutation(kept)[:MOST]
+    kept = kept[~bev_iou(enlarge_boxes(boxes[kept]),
+                         enlarge_boxes(scene.boxes, MIN_DISTANCE_M)).any(axis=1)]
+    kept = rng.permutation(kept)[:MAX_THINGS]
     return boxes[kept], [scene.points[ids == k + 1] for k in kept]

@@ -1,6 +1,6 @@
-"""Scenes to batches: an endless stream whose n-th element depends on n and the seed alone.
+"""Batches of samples from scenes: an endless stream whose n-th element depends on n and the seed.
 
-So neither the number of worker processes nor a stop in between changes what is learned from.
+Neither the number of worker processes nor an interruption changes the samples.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from lidar_perception.runs.processes import in_order
 from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
 
-AHEAD = 4  # batches that each worker prepares in advance
+PREFETCH = 4  # batches that each worker prepares in advance
 
 
 class Item(NamedTuple):
-    """What prepare made of a scene, and why others were skipped."""
+    """A sample, and the reasons for which other scenes were skipped before it."""
 
     sample: Any
     skipped: tuple[str, ...] = ()
@@ -29,11 +29,15 @@ class Item(NamedTuple):
 
 @dataclass(frozen=True)
 class Stream:
-    """stream[n], n = 0, 1, ...: every scene of all sources once an epoch, in an order of its own;
-    prepare(scene, rng) makes the sample.
+    """Endless sequence of samples: each epoch has every scene of all sources in a new order.
 
-    A scene that cannot be read or prepared (InputError) is skipped, and the next one in the order
-    taken. InputError if none can be used.
+    A scene that cannot be read or prepared (InputError) is skipped and replaced by the next one.
+    stream[n] raises InputError if no scene can be used.
+
+    Attributes:
+        sources: Sources with scene(i) and a length.
+        prepare: prepare(scene, rng) makes the sample.
+        seed: Seed of order and samples.
     """
 
     sources: tuple[Any, ...]
@@ -41,7 +45,7 @@ class Stream:
     seed: int = 0
 
     def __len__(self) -> int:
-        """Scenes of an epoch."""
+        """Return the number of scenes in an epoch."""
         return sum(map(len, self.sources))
 
     def __getitem__(self, n: int) -> Item:
@@ -51,15 +55,15 @@ class Stream:
         for offset in range(len(self)):
             rng = np.random.default_rng([self.seed, n, offset])
             try:
-                source, i = source_of(self.sources, int(order[(first + offset) % len(self)]))
+                source, i = find_source(self.sources, int(order[(first + offset) % len(self)]))
                 return Item(self.prepare(source.scene(i), rng), tuple(skipped))
             except InputError as error:
                 skipped.append(str(error))
         raise InputError(f"none of the {len(self)} scenes can be used ({skipped[0]})")
 
 
-def source_of(sources: Sequence[Any], n: int) -> tuple[Any, int]:
-    """Of the n-th scene of all sources, one behind the other: its source, and its number there."""
+def find_source(sources: Sequence[Any], n: int) -> tuple[Any, int]:
+    """Return the source of the n-th scene of concatenated sources, and its number there."""
     for source in sources:
         if n < len(source):
             return source, n
@@ -68,9 +72,11 @@ def source_of(sources: Sequence[Any], n: int) -> tuple[Any, int]:
 
 
 @dataclass(frozen=True)
-class ReadScenes:
-    """scenes[n]: an Item of what is read of the n-th scene of all sources, None if it cannot be
-    read. read(source, i) reads one, or raises InputError."""
+class SceneReader:
+    """Reads the n-th scene of concatenated sources as an Item; its sample is None on failure.
+
+    read(source, i) reads one scene, or raises InputError.
+    """
 
     sources: tuple[Any, ...]
     read: Callable[[Any, int], Any]
@@ -80,16 +86,22 @@ class ReadScenes:
 
     def __getitem__(self, n: int) -> Item:
         try:
-            return Item(self.read(*source_of(self.sources, n)))
+            return Item(self.read(*find_source(self.sources, n)))
         except InputError as error:
             return Item(None, (str(error),))
 
 
 @dataclass
 class Batches:
-    """batches(step): lists of `size` samples, of that step and all later ones. jobs: worker
-    processes, 0 for none. rank, world: which of several processes this is. skipped: the reasons so
-    far, each said once."""
+    """Batches of a stream: batches(step) iterates over those of that step and all later ones.
+
+    Attributes:
+        stream: The samples.
+        size: Samples in a batch.
+        jobs: Worker processes, 0 for none.
+        rank, world: Number of this process and of all processes that train together.
+        skipped: Count of each reason for which a scene was skipped; each is printed once.
+    """
 
     stream: Stream
     size: int
@@ -104,13 +116,13 @@ class Batches:
         return max(1, round(len(self.stream) / (self.size * self.world)))
 
     def numbers(self, step: int) -> Iterator[list[int]]:
-        """Elements of the stream for each step from `step` on."""
+        """Yield the elements of the stream for each step from `step` on."""
         for i in count(step):
             first = (i * self.world + self.rank) * self.size
             yield list(range(first, first + self.size))
 
     def __call__(self, step: int) -> Iterator[list[Any]]:
-        for items in loaded(self.stream, self.numbers(step), self.jobs):
+        for items in load_items(self.stream, self.numbers(step), self.jobs):
             for reason in (r for item in items for r in item.skipped):
                 if reason not in self.skipped:
                     errors.print(f"skipped: {reason}")
@@ -118,14 +130,23 @@ class Batches:
             yield [item.sample for item in items]
 
 
-def loaded(items: Any, numbers: Iterator[list[int]], jobs: int) -> Iterator[list[Any]]:
-    """[items[n] for n in each], in order, made by so many processes; 0 makes them here. InputError
-    where one of these ends, as when memory is short."""
+def load_items(items: Any, numbers: Iterator[list[int]], jobs: int) -> Iterator[list[Any]]:
+    """Yield [items[n] for n in group] for each group of numbers, in order.
+
+    Args:
+        items: Anything that can be indexed and sent to other processes.
+        numbers: Groups of indices.
+        jobs: Worker processes; 0 loads in this process.
+
+    Raises:
+        InputError: A worker process ended, for example for lack of memory.
+    """
     if jobs == 0:
-        yield from map(_maker(items), numbers)
+        yield from map(_make_loader(items), numbers)
     else:
-        yield from in_order(partial(_maker, items), numbers, jobs, AHEAD, "prepared scenes")
+        yield from in_order(partial(_make_loader, items), numbers, jobs, PREFETCH,
+                            "prepared scenes")
 
 
-def _maker(items: Any) -> Callable[[list[int]], list[Any]]:
-    return lambda each: [items[n] for n in each]
+def _make_loader(items: Any) -> Callable[[list[int]], list[Any]]:
+    return lambda group: [items[n] for n in group]

@@ -1,4 +1,4 @@
-"""Logs of a training run: CSV files, and TensorBoard where it is installed."""
+"""Logs of a training run: CSV files, and TensorBoard if it is installed."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from lidar_perception.types import InputError
 
 
 class Table:
-    """A CSV file with a column step; rows are appended and flushed. Its columns are those of the
-    first row."""
+    """A CSV file with a column "step", whose rows are flushed. The first row sets the columns."""
 
     def __init__(self, path: Path, step: int):
-        """Rows after `step`, of a run that was killed after its last save, are removed."""
+        """Open a table and drop rows after `step`, which a run wrote after its last save."""
         self.path, self.columns = path, None
         self.stream: TextIO | None = None
-        rows = _rows(path)
+        rows = _read_rows(path)
         if rows:
             self.columns = rows[0]
             kept = [rows[0]] + [row for row in rows[1:]
@@ -30,7 +29,7 @@ class Table:
             write_text(path, text.getvalue())
 
     def add(self, step: int, values: dict[str, float]) -> None:
-        """Append a row. InputError where it cannot be written."""
+        """Append a row. Raise InputError if it cannot be written."""
         try:
             if self.stream is None:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -39,22 +38,23 @@ class Table:
             if self.columns is None:
                 self.columns = ["step", *values]
                 writer.writerow(self.columns)
-            writer.writerow([step, *(_shown(values.get(name)) for name in self.columns[1:])])
+            writer.writerow([step, *(_format_cell(values.get(name)) for name in self.columns[1:])])
             self.stream.flush()
         except OSError as error:
             raise InputError(f"cannot write {self.path}: {error.strerror}") from None
 
     def close(self) -> None:
+        """Close the file."""
         if self.stream is not None:
-            with suppress(OSError):  # of a disk that is full; add() has said so
+            with suppress(OSError):  # of a full disk, which add() has reported
                 self.stream.close()
 
 
-def _shown(value: Any) -> str:
+def _format_cell(value: Any) -> str:
     return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _rows(path: Path) -> list[list[str]]:
+def _read_rows(path: Path) -> list[list[str]]:
     if not path.is_file():
         return []
     try:
@@ -62,11 +62,11 @@ def _rows(path: Path) -> list[list[str]]:
             rows = list(csv.reader(stream))
         return [row for i, row in enumerate(rows) if i == 0 or (row and row[0].isdigit())]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"cannot read {path}: {error}; move it away") from None
+        raise InputError(f"cannot read {path}: {error}; rename or remove it") from None
 
 
 class Log:
-    """log.csv (losses), validation.csv (metrics) and TensorBoard's events in a folder."""
+    """The logs in a folder: log.csv (losses), validation.csv (metrics) and TensorBoard events."""
 
     def __init__(self, folder: Path, step: int):
         self.tables = {"loss": Table(folder / "log.csv", step),
@@ -79,13 +79,14 @@ class Log:
         self.board = SummaryWriter(folder / "tensorboard", purge_step=step + 1 if step else None)
 
     def add(self, kind: str, step: int, values: dict[str, float]) -> None:
-        """kind: loss or validation."""
+        """Append a row of kind "loss" or "validation"."""
         self.tables[kind].add(step, values)
         for name, value in values.items():
             if self.board is not None and value is not None:
                 self.board.add_scalar(f"{kind}/{name}", value, step)
 
     def close(self) -> None:
+        """Close all files."""
         for table in self.tables.values():
             table.close()
         if self.board is not None:

@@ -1,4 +1,4 @@
-"""How much fits into a time: scans, steps and validations, from the speed of a machine."""
+"""Training plans: how many scans, steps and validations fit into a time budget."""
 
 from __future__ import annotations
 
@@ -6,23 +6,29 @@ from dataclasses import dataclass, replace
 
 from lidar_perception.types import InputError
 
-RESERVE = 0.1         # of the budget, for what was not measured
-STARTING = 20.0       # seconds until processes run
-PREPARING = 0.25      # of the time, at most, to make scenes
-VALIDATING = 0.12     # of it, to validate
-SCANS, VAL_SCANS = (24, 3000), (16, 200)
-VALIDATIONS = 6
-PASSES = 4, 80        # over the scenes: fewer show too little of each, more learn nothing new
-WHOLE_RANGE = 12_000  # steps from which on the whole range is trained on, not a part of it
-LEAST_STEPS = 20      # in fewer nothing is learned
+RESERVE_SHARE = 0.1         # of the budget, for everything that was not measured
+STARTUP_S = 20.0            # until the processes run
+MAX_PREPARATION_SHARE = 0.25  # of the time, to make scenes
+VALIDATION_SHARE = 0.12     # of the time, to validate
+SCANS_RANGE, VAL_SCANS_RANGE = (24, 3000), (16, 200)
+MAX_VALIDATIONS = 6
+PASSES_RANGE = 4, 80        # over the scenes: fewer show each too rarely, more teach nothing new
+FULL_RANGE_STEPS = 12_000   # from this many steps on, training covers the whole detection range
+MIN_STEPS = 20              # fewer steps teach nothing
 
 
 @dataclass(frozen=True)
 class Speed:
-    """What was measured, in seconds: scan, cut: of one core, to simulate a scan and to cut objects
-    or clusters out of it (scan 0: nothing is simulated); step, whole: a step on the part of the
-    range that is quicker, and on all of it; frame: to validate a frame. scan_mb: size of what is
-    kept of a scan."""
+    """Measured durations in seconds.
+
+    Attributes:
+        scan: To simulate a scan on one core; 0 if nothing is simulated.
+        cut: To cut objects or clusters out of a scan on one core.
+        step: A training step on the reduced range.
+        whole: A training step on the whole range.
+        frame: To validate a frame.
+        scan_mb: Size of a cached scan, MB.
+    """
 
     scan: float
     cut: float
@@ -34,8 +40,15 @@ class Speed:
 
 @dataclass(frozen=True)
 class Plan:
-    """scans to train on, val_scans to validate on, cuts: scenes that are cut; steps, and
-    validate_steps from one validation to the next; part: only the quick part of the range."""
+    """Numbers of a training run.
+
+    Attributes:
+        scans, val_scans: Simulated scans to train on and to validate on.
+        cuts: Scenes that objects or clusters are cut from.
+        steps: Training steps.
+        validate_steps: Steps from one validation to the next.
+        part: Train on the reduced range only.
+    """
 
     scans: int = 0
     val_scans: int = 0
@@ -47,8 +60,14 @@ class Plan:
 
 @dataclass(frozen=True)
 class Data:
-    """What is there to learn from: whether scans are simulated to train on, and to validate on; how
-    many recorded scenes there are of both; scenes in a step; scenes that are cut at most."""
+    """Scenes that are available.
+
+    Attributes:
+        simulated, val_simulated: Scans are simulated to train on, and to validate on.
+        recorded, val_recorded: Recorded scenes to train on, and to validate on.
+        batch: Scenes in a step.
+        most_cuts: Largest number of scenes to cut objects or clusters from.
+    """
 
     simulated: bool
     val_simulated: bool
@@ -58,78 +77,95 @@ class Data:
     most_cuts: int
 
 
-def plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(),
-         epochs: float = 0.0) -> Plan:
-    """The plan that fits into so many hours. given: what is fixed, where it is not 0 (part False:
-    no part of the range), whether it fits or not; epochs: passes over the data, likewise.
+def fit_plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(),
+             epochs: float = 0.0) -> Plan:
+    """Return the plan that uses a time budget best.
 
-    As many scenes as are seen four times, and take a quarter of the time at most; what these and
-    validation leave is for steps. InputError if the time is too short for LEAST_STEPS.
+    It has as many scans as can be seen four times, in at most a quarter of the time. The steps get
+    the time that scans and validations leave.
+
+    Args:
+        hours: Time budget.
+        cores: Processor cores.
+        speed: Measured durations.
+        data: Available scenes.
+        given: Numbers that are fixed where not 0, even if they exceed the budget; part=False
+            rules out the reduced range.
+        epochs: Fixed passes over the data, 0 for none.
+
+    Raises:
+        InputError: The budget is too short for MIN_STEPS.
     """
-    made = _fitted(hours, cores, speed, data, given, epochs)
-    if given.steps or epochs or made.steps >= LEAST_STEPS:
-        return made
+    fitting = _fit_any(hours, cores, speed, data, given, epochs)
+    if given.steps or epochs or fitting.steps >= MIN_STEPS:
+        return fitting
     enough = hours
-    while _fitted(enough, cores, speed, data, given, epochs).steps < LEAST_STEPS:
+    while _fit_any(enough, cores, speed, data, given, epochs).steps < MIN_STEPS:
         enough = 1.2 * enough
-    raise InputError(f"a budget of {hours:g} h is too short for {LEAST_STEPS} steps on this "
+    raise InputError(f"a budget of {hours:g} h is too short for {MIN_STEPS} steps on this "
                      f"machine: give --budget {1.05 * enough:.2g} or more, or fewer --data-scans "
                      "and --data-val-scans")
 
 
-def _fitted(hours: float, cores: int, speed: Speed, data: Data, given: Plan,
-            epochs: float) -> Plan:
-    """As plan, with as few steps as there is time for."""
-    time = 3600 * hours * (1 - RESERVE) - STARTING
+def _fit_any(hours: float, cores: int, speed: Speed, data: Data, given: Plan,
+             epochs: float) -> Plan:
+    """Fit a plan whose number of steps may be too small."""
+    time = 3600 * hours * (1 - RESERVE_SHARE) - STARTUP_S
     scans, val, steps = given.scans, given.val_scans, given.steps
     if data.simulated and not scans:
-        each = (speed.scan + speed.cut) / cores
-        scans = _within(min(PREPARING * time / each, (1 - VALIDATING) * time / (
-            each + PASSES[0] * speed.step / data.batch)), SCANS)
+        preparation = (speed.scan + speed.cut) / cores
+        scans = _clip(min(MAX_PREPARATION_SHARE * time / preparation,
+                          (1 - VALIDATION_SHARE) * time / (
+                              preparation + PASSES_RANGE[0] * speed.step / data.batch)),
+                      SCANS_RANGE)
         scans = min(scans, steps * data.batch) if steps else scans
     scenes = (scans if data.simulated else 0) + data.recorded
     if data.val_simulated and not val:
-        val = _within(min(scenes / 8, VALIDATING * time / VALIDATIONS / speed.frame), VAL_SCANS)
+        val = _clip(min(scenes / 8, VALIDATION_SHARE * time / MAX_VALIDATIONS / speed.frame),
+                    VAL_SCANS_RANGE)
     epoch = max(1, round(scenes / data.batch))
     steps = steps or (max(1, round(epochs * epoch)) if epochs else 0)
-    made = Plan(scans, val, given.cuts or min(scenes, data.most_cuts), steps, given.validate_steps)
-    once = speed.frame * (val + data.val_recorded)
-    validations = max(1, min(VALIDATIONS, int(VALIDATING * time / once)))
-    left = time - preparing(made, cores, speed) - validations * once
-    part = given.part and left / speed.whole < WHOLE_RANGE
+    unstepped = Plan(scans, val, given.cuts or min(scenes, data.most_cuts), steps,
+                     given.validate_steps)
+    validation = speed.frame * (val + data.val_recorded)
+    validations = max(1, min(MAX_VALIDATIONS, int(VALIDATION_SHARE * time / validation)))
+    left = time - preparation_duration(unstepped, cores, speed) - validations * validation
+    part = given.part and left / speed.whole < FULL_RANGE_STEPS
     steps = steps or max(0, min(int(left / (speed.step if part else speed.whole)),
-                                PASSES[1] * epoch))
-    return replace(made, part=part, steps=steps,
+                                PASSES_RANGE[1] * epoch))
+    return replace(unstepped, part=part, steps=steps,
                    validate_steps=given.validate_steps or max(1, -(-steps // validations)))
 
 
-def refitted(made: Plan, seconds: float, slower: float, speed: Speed, data: Data) -> Plan:
-    """The plan with as many of its steps as fit into what time is left, on a machine that many
-    times slower than measured; LEAST_STEPS at least."""
-    steps, validating = training(made, speed, data)
-    fit = ((1 - RESERVE) * seconds / slower - validating) / (steps / made.steps)
-    few = min(made.steps, max(LEAST_STEPS, int(fit)))
-    validations = -(-made.steps // made.validate_steps)
-    return made if few > (1 - RESERVE) * made.steps else replace(
-        made, steps=few, validate_steps=-(-few // validations))
+def shorten_plan(plan: Plan, seconds: float, slowdown: float, speed: Speed, data: Data) -> Plan:
+    """Return the plan with as many of its steps as fit into the seconds that are left.
+
+    At least MIN_STEPS stay. slowdown: the machine is this many times slower than measured.
+    """
+    steps, validations = training_durations(plan, speed, data)
+    fit = ((1 - RESERVE_SHARE) * seconds / slowdown - validations) / (steps / plan.steps)
+    shortened = min(plan.steps, max(MIN_STEPS, int(fit)))
+    count = -(-plan.steps // plan.validate_steps)
+    return plan if shortened > (1 - RESERVE_SHARE) * plan.steps else replace(
+        plan, steps=shortened, validate_steps=-(-shortened // count))
 
 
-def preparing(plan: Plan, cores: int, speed: Speed) -> float:
-    """Seconds to make all scenes."""
+def preparation_duration(plan: Plan, cores: int, speed: Speed) -> float:
+    """Return the duration of making all scenes, in seconds."""
     return (speed.scan * (plan.scans + plan.val_scans) + speed.cut * plan.cuts) / cores
 
 
-def training(plan: Plan, speed: Speed, data: Data) -> tuple[float, float]:
-    """Seconds of all steps, and of all validations."""
+def training_durations(plan: Plan, speed: Speed, data: Data) -> tuple[float, float]:
+    """Return the durations of all steps and of all validations, in seconds."""
     validations = -(-plan.steps // plan.validate_steps)
     return (plan.steps * (speed.step if plan.part else speed.whole),
-            validations * validation(plan, speed, data))
+            validations * validation_duration(plan, speed, data))
 
 
-def validation(plan: Plan, speed: Speed, data: Data) -> float:
-    """Seconds of one validation."""
+def validation_duration(plan: Plan, speed: Speed, data: Data) -> float:
+    """Return the duration of one validation, in seconds."""
     return (plan.val_scans + data.val_recorded) * speed.frame
 
 
-def _within(value: float, bounds: tuple[int, int]) -> int:
+def _clip(value: float, bounds: tuple[int, int]) -> int:
     return int(min(max(value, bounds[0]), bounds[1]))

@@ -1,4 +1,4 @@
-"""What is written about a training run, in a checkpoint and in the log."""
+"""Records of a training run: the header of its checkpoints, and its metrics."""
 
 from __future__ import annotations
 
@@ -19,67 +19,91 @@ from lidar_perception.scoring.kitti.reliability import lines
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.data import Batches
 from lidar_perception.training.params import LoopParams
-from lidar_perception.training.run import Judged
+from lidar_perception.training.run import Validation
 from lidar_perception.types import InputError
 
 
-def record_of(params: LoopParams, batches: Batches, record: dict[str, Any],
-              about: dict[str, Any]) -> dict[str, Any]:
-    """What the header says of the training. record: what the loop gives keep; about: of the
-    data."""
+def make_record(params: LoopParams, batches: Batches, record: dict[str, Any],
+                about: dict[str, Any]) -> dict[str, Any]:
+    """Return the training section of a checkpoint header.
+
+    Args:
+        params: Parameters of the training.
+        batches: The samples, which know the scenes that could not be used.
+        record: Progress, as the loop passes it to Task.save.
+        about: Description of the data.
+    """
     return {**about, "seed": params.seed, "steps": record["step"],
             "seconds": round(record["seconds"]), "steps_skipped": record["skipped"],
             "scenes_skipped": len(batches.skipped), "batch": params.batch * batches.world,
             "params": flatten(params), "version": __version__}
 
 
-def keeper(out: Path, config: Any, params: LoopParams, batches: Batches,
-           about: dict[str, Any], commit: str) -> Callable[[str, nn.Module, dict[str, Any]], None]:
-    """keep(name, module, record) of a Task: writes out/name.safetensors."""
-    def keep(name: str, module: nn.Module, record: dict[str, Any]) -> None:
-        header = Header(config, record_of(params, batches, record, about),
-                      rounded(record.get("metrics", {})), commit, record.get("calibration", {}))
+def make_save(out: Path, config: Any, params: LoopParams, batches: Batches,
+              about: dict[str, Any],
+              commit: str) -> Callable[[str, nn.Module, dict[str, Any]], None]:
+    """Return the save function of a Task, which writes out/name.safetensors."""
+    def save(name: str, module: nn.Module, record: dict[str, Any]) -> None:
+        header = Header(config, make_record(params, batches, record, about),
+                        round_metrics(record.get("metrics", {})), commit,
+                        record.get("calibration", {}))
         save_checkpoint(out / f"{name}.safetensors", module, header)
 
-    return keep
+    return save
 
 
-def begun_with(network: Net, init: Path | None, kind: type[Config]) -> Net:
-    """The network, with the weights of init as far as they fit; what does not is said."""
+def load_initial_weights(network: Net, init: Path | None, kind: type[Config]) -> Net:
+    """Load the tensors of a checkpoint that fit the network, and report how many do."""
     if init is not None:
         taken, count = adopt(network, init, kind)
         if taken < count:
-            errors.print(f"{taken} of {count} tensors are of {init}, the others begin at random")
+            errors.print(f"{taken} of {count} tensors are from {init}, the others begin at random")
     return network
 
 
-def name_skipped(skipped: Sequence[str], left: int, named: set[str]) -> None:
-    """Say of which frames nothing was found, and why, but for the reasons in named, which they are
-    added to. InputError where none is left to validate on."""
+def report_skipped(skipped: Sequence[str], left: int, reported: set[str]) -> None:
+    """Print why validation frames were skipped, and add the reasons to those already reported.
+
+    Args:
+        skipped: Reasons.
+        left: Number of frames that remain.
+        reported: Reasons that were printed before.
+
+    Raises:
+        InputError: No frame is left.
+    """
     for reason in dict.fromkeys(skipped):
-        if reason not in named:
+        if reason not in reported:
             errors.print(f"validation: {reason}")
-    named.update(skipped)
+    reported.update(skipped)
     if left == 0:
         raise InputError("no frame to validate on can be used "
                          f"({next(iter(skipped), 'there is none')})")
 
 
-def rounded(metrics: dict[str, float]) -> dict[str, float | None]:
-    """For JSON: NaN as None."""
+def round_metrics(metrics: dict[str, float]) -> dict[str, float | None]:
+    """Return metrics for JSON, in which NaN is None."""
     return {key: None if math.isnan(value) else round(value, 3) for key, value in metrics.items()}
 
 
-def judged(report: DetectionReport, score: str, classes: Sequence[str]) -> Judged:
-    """What Task.validate gives of a report of the network's own scores."""
-    return (metrics_of(report.compute(), score, classes),
+def summarize_report(report: DetectionReport, score: str, classes: Sequence[str]) -> Validation:
+    """Return metrics and calibration, as Task.validate does, of a network's own scores."""
+    return (select_metrics(report.compute(), score, classes),
             lines(Comparison.of(report.frames)) if report.frames else {})
 
 
-def metrics_of(content: dict[str, Any], score: str, classes: Sequence[str]) -> dict[str, float]:
-    """score, the mean over the classes with objects, and each class's AP from above at the relaxed
-    overlaps and in space at the strict ones (moderate, R40); each is NaN without objects. content
-    is that of a DetectionReport."""
+def select_metrics(content: dict[str, Any], score: str,
+                   classes: Sequence[str]) -> dict[str, float]:
+    """Return each class's AP at the relaxed BEV and strict 3D overlaps (moderate, R40).
+
+    Args:
+        content: Content of a DetectionReport.
+        score: "bev" or "map": the AP whose mean over the classes is the "score".
+        classes: Names of the classes.
+
+    Returns:
+        Metrics by name, NaN where there are no objects. The score ignores such classes.
+    """
     metrics: dict[str, float] = {}
     for name in classes:
         for row in "bev_relaxed", "3d":

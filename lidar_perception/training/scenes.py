@@ -1,7 +1,7 @@
-"""Where labelled scenes come from: recordings, and simulated scenes with a cache on disk.
+"""Sources of labelled scenes: recordings, and simulated scenes with a cache on disk.
 
 A source has a length, scene(i) to train on, and frame(i) to validate on. It can be sent to other
-processes: files are opened where they are read.
+processes: each opens the files that it reads.
 """
 
 from __future__ import annotations
@@ -26,15 +26,20 @@ from lidar_perception.simulation.drive import longest_drive, scan_at
 from lidar_perception.simulation.scene import ANY, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.augment import TrainingScene
-from lidar_perception.training.cache import kept, path_in, size_of, state_of
+from lidar_perception.training.cache import cache_path, file_fingerprint, folder_size, load_or_make
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
 
 
 @dataclass(frozen=True)
 class RecordedScenes:
-    """The frames of a recording with these names. view: the points in the image only, where there
-    is a camera, as the labels end there. height: of the sensor above the ground, metres, where it
-    is not what the recording says."""
+    """Frames of a recording.
+
+    Attributes:
+        path: The recording.
+        names: Names of the frames.
+        view: Use only the points in the image if there is a camera, as labels end there.
+        height: Height of the sensor above the ground in metres; None: as the recording says.
+    """
 
     path: Path
     names: tuple[str, ...]
@@ -47,38 +52,38 @@ class RecordedScenes:
     @cached_property
     def _frames(self) -> dict[str, Frame]:
         frames = open_recording(self.path, sensor_height=self.height).frames[:]
-        known = {frame.name: frame for frame in frames}
-        return {name: known[name] for name in self.names}
+        by_name = {frame.name: frame for frame in frames}
+        return {name: by_name[name] for name in self.names}
 
     def __getstate__(self) -> dict:
-        return {k: v for k, v in self.__dict__.items() if k != "_frames"}  # open where it is read
+        return {k: v for k, v in self.__dict__.items() if k != "_frames"}  # not sent, see above
 
     @property
     def sensor_height(self) -> float:
-        """Of the first frame, metres above the ground."""
+        """Height of the sensor above the ground in the first frame, in metres."""
         return self._frames[self.names[0]].sensor_height
 
     def key(self, i: int) -> str:
-        """All that scene i depends on: another one once a file of it was written again."""
+        """Return a cache key of scene i, which changes when one of its files is written."""
         frame = self._frames[self.names[i]]
-        return repr((*map(state_of, frame.files), with_topic(self.path)[1], frame.name, self.view,
-                     frame.sensor_height))
+        return repr((*map(file_fingerprint, frame.files), with_topic(self.path)[1], frame.name,
+                     self.view, frame.sensor_height))
 
     def scene(self, i: int) -> TrainingScene:
-        """InputError naming the file that cannot be used."""
-        frame, truth = self._labelled(i)
+        """Return scene i to train on. Raise InputError, naming the file, if it is broken."""
+        frame, truth = self._labelled_frame(i)
         scan, camera = frame.load(), frame.camera()
         points = scan.points()
         if self.view and camera is not None:
             points = points[camera.in_view(scan.xyz)]
         return TrainingScene(points, truth.boxes, truth.class_ids, np.ones(len(truth), bool),
-                     camera is None, frame.sensor_height)
+                             camera is None, frame.sensor_height)
 
     def frame(self, i: int) -> Frame:
-        """To validate on: the whole scan. InputError if it has no labels."""
-        return self._labelled(i)[0]
+        """Return the whole scan to validate on. Raise InputError if it has no labels."""
+        return self._labelled_frame(i)[0]
 
-    def _labelled(self, i: int) -> tuple[Frame, GroundTruth]:
+    def _labelled_frame(self, i: int) -> tuple[Frame, GroundTruth]:
         frame = self._frames[self.names[i]]
         truth = frame.truth()
         if truth is None:
@@ -88,10 +93,20 @@ class RecordedScenes:
 
 @dataclass(frozen=True)
 class SimulatedScenes:
-    """count scans of the scenes first, first + 1, ..., of each so many, spread over its drive. To
-    make a scene takes as long as to scan it. cache: folder for scans, or None; from cache_gb on
-    nothing is added to it. around: frames to validate on have their labels in the image of a camera
-    that looks ahead, left, behind, right in turn, not ahead only."""
+    """Simulated scans of the scenes first, first + 1, ...
+
+    Attributes:
+        first: Seed of the first scene.
+        count: Number of scans.
+        sensor: The sensor.
+        scenes: Kinds of scenes.
+        cache: Folder that keeps scans, or None.
+        cache_gb: Size of the cache, GB, from which on nothing is added to it.
+        per_scene: Scans of each scene, spread over its drive. Making a scene takes as long as
+            scanning it once.
+        around: Frames to validate on have labels in the image of a camera that looks ahead, left,
+            behind and right in turn, instead of ahead only.
+    """
 
     first: int
     count: int
@@ -105,30 +120,33 @@ class SimulatedScenes:
     def __len__(self) -> int:
         return self.count
 
-    def at(self, i: int) -> tuple[int, int]:
-        """Scene and frame of scan i."""
+    def locate(self, i: int) -> tuple[int, int]:
+        """Return the seed of scan i's scene, and the number of the frame in its drive."""
         scene, part = divmod(i, self.per_scene)
         return self.first + scene, part * longest_drive(self.sensor) // self.per_scene
 
     def key(self, i: int) -> str:
-        """All that scan i depends on."""
-        return repr((self.sensor, tuple(self.scenes), self.at(i)))
+        """Return a cache key of scan i."""
+        return repr((self.sensor, tuple(self.scenes), self.locate(i)))
 
     def path(self, i: int) -> Path | None:
-        """The file that keeps scan i."""
-        return path_in(self.cache, self.key(i))
+        """Return the cache file of scan i."""
+        return cache_path(self.cache, self.key(i))
 
     def scene(self, i: int) -> TrainingScene:
-        """With the labels all around."""
+        """Return scene i to train on, with labels all around."""
         frame, truth = self.scan(i)
         return TrainingScene(frame.points(), truth.boxes, truth.class_ids, worth_a_label(truth),
                              True, self.sensor.height)
 
     def frame(self, i: int) -> Frame:
-        """To validate on: with the labels that KITTI would have in the image of a camera, or all
-        around where there is none."""
+        """Return scan i to validate on.
+
+        It has the labels that KITTI would have in a camera's image, or all labels for scenes
+        without a camera.
+        """
         scan, truth = self.scan(i)
-        scene, part = self.at(i)
+        scene, part = self.locate(i)
         if not self.scenes.camera:
             return Frame.of(f"scene {scene} frame {part}", scan, labels_around(truth),
                             sensor_height=self.sensor.height)
@@ -137,17 +155,17 @@ class SimulatedScenes:
                         sensor_height=self.sensor.height)
 
     def scan(self, i: int) -> tuple[LidarFrame, GroundTruth]:
-        """The frame and all its objects, from the cache if they are there."""
-        return kept(self.path(i), lambda: self._simulated(i), _read_scan, _scan_arrays,
-                    self.cache_gb)
+        """Return scan i with all its objects, from the cache if possible."""
+        return load_or_make(self.path(i), lambda: self._simulate(i), _read_scan, _scan_arrays,
+                            self.cache_gb)
 
     def keep(self, i: int) -> None:
         """Put scan i into the cache, if there is room."""
-        if self.cache is not None and size_of(self.cache) < self.cache_gb * 1e9:
+        if self.cache is not None and folder_size(self.cache) < self.cache_gb * 1e9:
             self.scan(i)
 
-    def _simulated(self, i: int) -> tuple[LidarFrame, GroundTruth]:
-        scan = scan_at(*self.at(i), self.sensor, self.scenes)
+    def _simulate(self, i: int) -> tuple[LidarFrame, GroundTruth]:
+        scan = scan_at(*self.locate(i), self.sensor, self.scenes)
         return scan.frame, scan.truth
 
 
@@ -156,7 +174,7 @@ EXTRAS = ("track_id", "truncated", "occluded", "num_points", "visible")
 
 def _scan_arrays(scan: tuple[LidarFrame, GroundTruth]) -> dict[str, np.ndarray]:
     frame, truth = scan
-    assert frame.intensity is not None  # as of all simulated scans
+    assert frame.intensity is not None  # simulated scans always have it
     extras = {name: np.array([e[name] for e in truth.extras]) for name in EXTRAS}
     return dict(xyz=frame.xyz, intensity=frame.intensity, boxes=truth.boxes,
                 class_ids=truth.class_ids, **extras)

@@ -1,4 +1,4 @@
-"""The learning rate of each step, and the average of the weights over the steps."""
+"""Learning rate schedule, and moving average of the weights."""
 
 from __future__ import annotations
 
@@ -8,31 +8,35 @@ import math
 import torch
 from torch import nn
 
-START, END = 10.0, 1e4          # the first rate is lr / START, the last that / END
-SLOW, FAST = 0.95, 0.85         # momentum while the rate is least and greatest
+START_DIVISOR, END_DIVISOR = 10.0, 1e4  # the first rate is lr / 10, the last lr / 10 / 1e4
+SLOW_MOMENTUM, FAST_MOMENTUM = 0.95, 0.85  # at the lowest and the highest rate
 
 
-def one_cycle(step: float, steps: int, lr: float, warm_share: float) -> tuple[float, float]:
-    """Learning rate and momentum of step 0 .. steps - 1: up to lr and down again along cosines
-    (Smith, 2018)."""
-    first, last = lr / START, lr / START / END
+def compute_one_cycle(step: float, steps: int, lr: float,
+                      warm_share: float) -> tuple[float, float]:
+    """Return learning rate and momentum of a step in 0 .. steps - 1 (one-cycle, Smith 2018).
+
+    The rate rises to lr during the share warm_share of the steps, then falls, both along cosines.
+    """
+    first, last = lr / START_DIVISOR, lr / START_DIVISOR / END_DIVISOR
     top = warm_share * steps - 1
     if step <= top:
-        share = _ramp(step / top) if top > 0 else 1.0  # of one step up: it is the highest
-        return first + (lr - first) * share, SLOW + (FAST - SLOW) * share
-    share = _ramp((step - top) / (steps - 1 - top)) if steps - 1 > top else 1.0
-    return lr + (last - lr) * share, FAST + (SLOW - FAST) * share
+        share = _cosine_ramp(step / top) if top > 0 else 1.0  # a single rising step is the top
+        return (first + (lr - first) * share,
+                SLOW_MOMENTUM + (FAST_MOMENTUM - SLOW_MOMENTUM) * share)
+    share = _cosine_ramp((step - top) / (steps - 1 - top)) if steps - 1 > top else 1.0
+    return lr + (last - lr) * share, FAST_MOMENTUM + (SLOW_MOMENTUM - FAST_MOMENTUM) * share
 
 
-def _ramp(x: float) -> float:
+def _cosine_ramp(x: float) -> float:
     return (1 - math.cos(math.pi * min(max(x, 0.0), 1.0))) / 2
 
 
-class Average:
-    """The exponential moving average of a module's weights and norms, as a module.
+class WeightAverage:
+    """Exponential moving average of a module's weights and norm statistics, as a module.
 
-    The t-th update (from 1) keeps min(decay, t / (t + 9)) of the average, so that the random
-    weights of the beginning are soon forgotten.
+    Update t (from 1) keeps min(decay, t / (t + 9)) of the average, so that the random initial
+    weights are soon forgotten.
     """
 
     def __init__(self, module: nn.Module, decay: float):
@@ -41,7 +45,7 @@ class Average:
 
     @torch.no_grad()
     def update(self, module: nn.Module) -> None:
-        """Take in the module's present weights; numbers that are not float are copied."""
+        """Add the module's present weights. Integer buffers are copied."""
         self.updates += 1
         decay = min(self.decay, self.updates / (self.updates + 9))
         for mean, value in zip(self.module.state_dict().values(), module.state_dict().values()):

@@ -1,5 +1,4 @@
-"""The fused detector of one's own weights: curves that are probabilities, in a file that names both
-networks, and any file that somebody wrote is used or refused in one line."""
+"""Fused detectors of other weights: curves are probabilities, and damaged files are refused."""
 
 from __future__ import annotations
 
@@ -39,15 +38,20 @@ from lidar_perception.detectors.pointpillars.weights_file import weights_file as
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.comparison.contenders import contenders
 from lidar_perception.simulation.camera import FORWARD_CAMERA
-from lidar_perception.training.fusing import FEWEST, Samples, fitted, samples_of
+from lidar_perception.training.fusion_curves import (
+    MIN_SAMPLES,
+    Samples,
+    collect_samples,
+    fit_classes,
+)
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def drawn(rng, count: int, class_id: int, odds: float = -1.5) -> Samples:
-    """Proposals of which the sources know as much as odds says, each with its own error."""
+def draw_samples(rng, count: int, class_id: int, odds: float = -1.5) -> Samples:
+    """Draw proposals whose log-odds have mean `odds`, and sources that know them with an error."""
     true = rng.normal(odds, 2.0, count)
     evidence = {name: np.clip(true + rng.normal(0, 0.5, count), -6.5, 6.5) for name in KNOTS}
     evidence["silhouette"][rng.random(count) < 0.2] = np.nan
@@ -57,41 +61,41 @@ def drawn(rng, count: int, class_id: int, odds: float = -1.5) -> Samples:
 
 @settings(max_examples=5)
 @given(SEEDS)
-def test_fitted_scores_are_probabilities_and_the_order_of_scans_does_not_matter(seed):
+def test_fitted_scores_are_probabilities_in_any_order_of_scans(seed):
     rng = np.random.default_rng(seed)
-    own = drawn(rng, 4000, PEDESTRIAN)
-    models, judged = fitted(own, package_models())
-    other = drawn(rng, 20_000, PEDESTRIAN)
+    own = draw_samples(rng, 4000, PEDESTRIAN)
+    models, fits = fit_classes(own, package_models())
+    other = draw_samples(rng, 20_000, PEDESTRIAN)
     scores = probabilities(models, other.class_ids, other.evidence)
     for low in np.arange(0.1, 0.9, 0.2):
         chosen = (scores >= low) & (scores < low + 0.2)
         assert abs(other.right[chosen].mean() - scores[chosen].mean()) < 0.08
-    assert judged["Pedestrian"].after.loss < judged["Pedestrian"].before.loss
-    assert judged["Pedestrian"].proposals == 4000
-    assert judged["Pedestrian"].right == own.right.sum()
-    again, _ = fitted(own.take(rng.permutation(4000)), package_models())
+    assert fits["Pedestrian"].after.loss < fits["Pedestrian"].before.loss
+    assert fits["Pedestrian"].proposals == 4000
+    assert fits["Pedestrian"].right == own.right.sum()
+    again, _ = fit_classes(own.take(rng.permutation(4000)), package_models())
     for curve, before in zip(again["Pedestrian"]["curves"].values(),
                              models["Pedestrian"]["curves"].values()):
         np.testing.assert_allclose(curve["values"], before["values"], atol=0.02)
-    # Of what there is too little of, the curves from before stay.
-    assert models["Car"] == package_models()["Car"] and judged["Car"].after is None
+    # A class with too few samples keeps its curves.
+    assert models["Car"] == package_models()["Car"] and fits["Car"].after is None
 
 
-def test_curves_are_not_fitted_to_too_little():
+def test_curves_are_not_fitted_to_too_few_samples():
     rng = np.random.default_rng(0)
-    for right in (0, FEWEST // 2 - 1, FEWEST * 3):
-        own = drawn(rng, 500, CAR)
+    for right in (0, MIN_SAMPLES // 2 - 1, MIN_SAMPLES * 3):
+        own = draw_samples(rng, 500, CAR)
         own.right[:] = np.arange(500) < right
         own.scans[:] = np.arange(500) % 2
-        models, judged = fitted(own, package_models())
-        assert (models["Car"] == package_models()["Car"]) == (right < FEWEST)
-        assert (judged["Car"].after is None) == (right < FEWEST)
-        models, _ = fitted(own, {"Cyclist": models["Cyclist"]})  # a class is new
-        assert ("Car" in models) == (right >= FEWEST)
+        models, fits = fit_classes(own, package_models())
+        assert (models["Car"] == package_models()["Car"]) == (right < MIN_SAMPLES)
+        assert (fits["Car"].after is None) == (right < MIN_SAMPLES)
+        models, _ = fit_classes(own, {"Cyclist": models["Cyclist"]})  # a new class
+        assert ("Car" in models) == (right >= MIN_SAMPLES)
 
 
 @pytest.mark.parametrize("camera", [None, FORWARD_CAMERA], ids=["all around", "in an image"])
-def test_an_object_counts_once_where_all_is_labelled_and_a_van_neither_way(camera: Camera | None):
+def test_object_counts_once_and_van_does_not_count(camera: Camera | None):
     car, person = [10, 0, -0.9, 4, 1.7, 1.5, 0], [12, 4, -0.8, 0.6, 0.6, 1.8, 0]
     behind, van = [-10, 0, -0.9, 4, 1.7, 1.5, 0], [10, 5, -0.7, 4.7, 1.9, 2.0, 0]
     nearly = np.add(person, [0.3, 0.2, 0, 0, 0, 0, 0])
@@ -102,7 +106,7 @@ def test_an_object_counts_once_where_all_is_labelled_and_a_van_neither_way(camer
                            [CAR, CAR, PEDESTRIAN, CLASSES.index("Van")])
     scan = frame()
     look = Look(found, {"network": np.arange(7.0)}, scan.xyz, scan.xyz[:0], None, {})
-    own = samples_of(Frame.of("street", scan, truth, camera), look, 7)
+    own = collect_samples(Frame.of("street", scan, truth, camera), look, 7)
     expected = {1.0: True, 2.0: True, 4.0: True, 5.0: False}
     if camera is not None:
         del expected[2.0]  # the car behind
@@ -112,7 +116,7 @@ def test_an_object_counts_once_where_all_is_labelled_and_a_van_neither_way(camer
 
 @pytest.fixture
 def others(tmp_path):
-    """A file with flatter curves than the package's, of a copy of the cluster network."""
+    """Write a fusion file with other curves than the package, for a copy of the PointNet."""
     classifier = tmp_path / "own/pointnet.safetensors"
     classifier.parent.mkdir()
     classifier.write_bytes(classifier_file(PointNetParams()).read_bytes())
@@ -123,7 +127,7 @@ def others(tmp_path):
     return tmp_path / "fused.json", models
 
 
-def test_a_file_is_read_as_it_was_written_wherever_its_folder_is(others, tmp_path, monkeypatch):
+def test_fusion_file_round_trip_in_moved_folder(others, tmp_path, monkeypatch):
     path, models = others
     fusion = read_fusion(path)
     assert fusion.models == models and fusion.fitted_to == {"scans": 3} and fusion.doubt is None
@@ -135,7 +139,7 @@ def test_a_file_is_read_as_it_was_written_wherever_its_folder_is(others, tmp_pat
     monkeypatch.chdir(moved)
     assert open_detector("fused.json", "cpu").models == models
     assert weights_file(FusedParams(weights="fused.json")).name == "fused.json"
-    # Weights that are trained on, or lost.
+    # Weights that changed or are lost.
     again.classifier.write_bytes(again.classifier.read_bytes() + b"\0")
     assert "pointnet.safetensors, so that its scores" in read_fusion(moved / "fused.json").doubt
     again.classifier.unlink()
@@ -143,7 +147,7 @@ def test_a_file_is_read_as_it_was_written_wherever_its_folder_is(others, tmp_pat
         read_fusion(moved / "fused.json")
 
 
-def test_the_curves_of_the_package_are_those_of_its_weights_and_of_no_others(others):
+def test_package_curves_warn_about_other_weights(others):
     path, _ = others
     assert fusion_of().doubt is None and doubts(PACKAGE, 1.73) == []
     assert open_detector("fused", "cpu").doubt is None
@@ -158,7 +162,7 @@ def test_the_curves_of_the_package_are_those_of_its_weights_and_of_no_others(oth
             fusion_of("", FusedParams(**{group: "nowhere"}))
 
 
-def test_what_it_never_detects_and_a_network_from_elsewhere_are_said(others):
+def test_missing_class_and_foreign_sensor_are_reported(others):
     path, models = others
     classifier = path.parent / "own/pointnet.safetensors"
     save_header(classifier, replace(read_header(classifier), training={
@@ -171,8 +175,7 @@ def test_what_it_never_detects_and_a_network_from_elsewhere_are_said(others):
     assert open_detector(path, "cpu").doubt == never
 
 
-def test_a_detector_weighs_by_its_own_curves(others):
-    """The same boxes, each as likely as these curves say; whatever it is told to see."""
+def test_detector_uses_its_own_curves_at_any_range(others):
     path, models = others
     loaded, package = load_fused_detector(path, "cpu"), load_fused_detector("", "cpu")
     mine = FusedDetector(random_detector("v4"), loaded.classifier, loaded.params, models)
@@ -185,7 +188,7 @@ def test_a_detector_weighs_by_its_own_curves(others):
     assert load_fused_detector(path, "cpu", half).proposer.network.amp == "bf16"
 
 
-def test_a_damaged_file_is_used_or_refused_with_one_line(tmp_path):
+def test_damaged_file_is_used_or_refused_in_one_line(tmp_path):
     rng, path, refused = np.random.default_rng(0), tmp_path / "damaged.json", 0
     evidence = {name: np.array([-9.0, 0.0, np.nan, np.inf]) for name in KNOTS}
     for _ in range(300):
@@ -202,12 +205,12 @@ def test_a_damaged_file_is_used_or_refused_with_one_line(tmp_path):
     assert 50 < refused < 300
 
 
-def test_it_is_compared_as_a_detector_of_its_own(others):
+def test_fusion_file_is_compared_as_separate_detector(others):
     found = {each.name: each.source for each in contenders([others[0]], "cpu")[0]}
     assert found["fused #2"] == str(others[0]) and found["fused"] != found["fused #2"]
 
 
-def test_train_fused_writes_what_commands_and_nodes_take(tmp_path, monkeypatch, capsys):
+def test_train_fused_writes_usable_file(tmp_path, monkeypatch, capsys):
     out = tmp_path / "made/fused.json"
     command = ["train", "fused", "--sensor", "vlp-16", "--mount-height", "1.0", "--scans", "2",
                "--range", "around", "--jobs", "1", "--out", out]

@@ -1,4 +1,4 @@
-"""Laws of the plan: what is planned fits into the time, and what is given stays."""
+"""Training plans: they fit into the budget, and given numbers stay."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from lidar_perception.training import loop
 from lidar_perception.training.loop import Pace
 from lidar_perception.training.plan import (
-    LEAST_STEPS,
-    SCANS,
+    MIN_STEPS,
+    SCANS_RANGE,
     Data,
     Plan,
     Speed,
-    plan,
-    preparing,
-    refitted,
-    training,
+    fit_plan,
+    preparation_duration,
+    shorten_plan,
+    training_durations,
 )
 from lidar_perception.types import InputError
 
@@ -37,80 +37,81 @@ data = st.one_of(st.builds(Data, st.just(True), st.just(True), st.integers(0, 50
 
 
 @given(speeds, data, st.floats(0.3, 100), st.integers(1, 64))
-def test_what_is_planned_fits_into_the_budget_or_is_refused_with_one_that_does(
+def test_plan_fits_budget_or_error_names_sufficient_budget(
         speed, data, hours, cores):
     try:
-        made = plan(hours, cores, speed, data)
+        made = fit_plan(hours, cores, speed, data)
     except InputError as error:
         enough = float(re.search(r"--budget (\S+) or", str(error))[1])
         assert enough > 0.9 * hours
         if enough < 300:
-            made = plan(1.1 * enough, cores, speed, data)
-            assert made.steps >= LEAST_STEPS
+            made = fit_plan(1.1 * enough, cores, speed, data)
+            assert made.steps >= MIN_STEPS
         return
-    assert preparing(made, cores, speed) + sum(training(made, speed, data)) <= 3600 * hours
-    assert made.steps >= LEAST_STEPS and 1 <= made.validate_steps <= made.steps
-    assert made.scans == 0 or SCANS[0] <= made.scans <= SCANS[1]
+    seconds = preparation_duration(made, cores, speed) + sum(training_durations(made, speed, data))
+    assert seconds <= 3600 * hours
+    assert made.steps >= MIN_STEPS and 1 <= made.validate_steps <= made.steps
+    assert made.scans == 0 or SCANS_RANGE[0] <= made.scans <= SCANS_RANGE[1]
     assert (made.scans > 0) == data.simulated and (made.val_scans > 0) == data.val_simulated
 
 
-def test_two_cores_in_two_hours():
-    made = plan(2.0, 2, SPEED, SIM)
+def test_plan_for_two_cores_and_two_hours():
+    made = fit_plan(2.0, 2, SPEED, SIM)
     assert 1000 < made.scans <= 3000 and made.part
-    assert 3 * made.scans <= 4 * made.steps <= 10 * made.scans  # each is seen several times
-    assert plan(50.0, 2, SPEED, SIM).part is False  # with much time all of the range is learned
+    assert 3 * made.scans <= 4 * made.steps <= 10 * made.scans  # each scene is seen several times
+    assert fit_plan(50.0, 2, SPEED, SIM).part is False  # with much time, the whole range
 
 
-def test_more_time_or_a_faster_machine_gives_more_of_everything():
-    slow, fast = plan(1.0, 2, SPEED, SIM), plan(2.0, 2, SPEED, SIM)
+def test_more_time_or_cores_give_larger_plan():
+    slow, fast = fit_plan(1.0, 2, SPEED, SIM), fit_plan(2.0, 2, SPEED, SIM)
     assert (slow.scans, slow.steps, slow.val_scans) < (fast.scans, fast.steps, fast.val_scans)
-    assert slow.scans < plan(1.0, 4, SPEED, SIM).scans
+    assert slow.scans < fit_plan(1.0, 4, SPEED, SIM).scans
 
 
-def test_what_is_given_wins():
-    made = plan(1.0, 2, SPEED, SIM, Plan(scans=30, val_scans=7, steps=5000, validate_steps=11,
+def test_given_numbers_are_kept():
+    made = fit_plan(1.0, 2, SPEED, SIM, Plan(scans=30, val_scans=7, steps=5000, validate_steps=11,
                                          part=False))
-    assert made == Plan(30, 7, 30, 5000, 11, False)  # it takes longer, as asked for
-    assert plan(1.0, 2, SPEED, SIM, Plan(scans=100), epochs=3).steps == 75
-    assert plan(1.0, 2, SPEED, SIM, Plan(steps=10)).scans <= 40  # no more than are looked at
+    assert made == Plan(30, 7, 30, 5000, 11, False)  # it takes longer than the budget
+    assert fit_plan(1.0, 2, SPEED, SIM, Plan(scans=100), epochs=3).steps == 75
+    assert fit_plan(1.0, 2, SPEED, SIM, Plan(steps=10)).scans <= 40  # not more than the steps use
 
 
 @given(st.floats(0, 7200), st.floats(1, 20))
-def test_after_a_slow_preparation_as_many_steps_are_left_as_fit(seconds, slower):
-    made = plan(2.0, 2, SPEED, SIM)
-    left = refitted(made, seconds, slower, SPEED, SIM)
-    assert LEAST_STEPS <= left.steps <= made.steps and left.validate_steps <= left.steps
-    assert (left.steps in (LEAST_STEPS, made.steps)
-            or slower * sum(training(left, SPEED, SIM)) <= seconds)
-    assert refitted(made, 7000.0, 1.0, SPEED, SIM) == made
+def test_slow_preparation_leaves_steps_that_fit(seconds, slower):
+    made = fit_plan(2.0, 2, SPEED, SIM)
+    left = shorten_plan(made, seconds, slower, SPEED, SIM)
+    assert MIN_STEPS <= left.steps <= made.steps and left.validate_steps <= left.steps
+    assert (left.steps in (MIN_STEPS, made.steps)
+            or slower * sum(training_durations(left, SPEED, SIM)) <= seconds)
+    assert shorten_plan(made, 7000.0, 1.0, SPEED, SIM) == made
 
 
-def test_a_pace_says_how_many_steps_fit_beside_validations(monkeypatch):
+def test_pace_counts_steps_that_fit_between_validations(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(loop.time, "monotonic", lambda: now[0])
-    pace = Pace(until=1000.0, every=10)
+    pace = Pace(until=1000.0, validate_steps=10)
     for _ in range(29):
         now[0] += 2.0
-        pace.step()
-        assert pace.fit(1) == math.inf and not pace.over()  # in its first minute
-    with pace.validating():
+        pace.count_step()
+        assert pace.steps_left(1) == math.inf and not pace.is_over()  # in its first minute
+    with pace.time_validation():
         now[0] += 10.0
     now[0] += 2.0
-    pace.step()
+    pace.count_step()
     # In 930 s: 2 steps, 30 times 10 s and 10 steps, 4 steps and 10 s for the last validation.
-    assert pace.fit(8) == pytest.approx(2 + 30 * 10 + 4 - loop.SPARE, abs=1)
+    assert pace.steps_left(8) == pytest.approx(2 + 30 * 10 + 4 - loop.SPARE_STEPS, abs=1)
     for _ in range(400):
         now[0] += 4.0
-        pace.step()
-    assert pace.seconds == pytest.approx(4.0, abs=0.2)  # what was long ago hardly counts
-    assert pace.over() and pace.fit(3) < 1
+        pace.count_step()
+    assert pace.step_duration == pytest.approx(4.0, abs=0.2)  # old steps hardly count
+    assert pace.is_over() and pace.steps_left(3) < 1
     endless = Pace(math.inf, 1)
     now[0] += 1e6
-    endless.step()
-    assert not endless.over() and endless.fit(1) == math.inf
+    endless.count_step()
+    assert not endless.is_over() and endless.steps_left(1) == math.inf
 
 
 @pytest.mark.parametrize("hours", [1e-4, 0.01])
-def test_a_budget_that_is_too_short_names_one_that_is_not(hours):
+def test_too_short_budget_names_sufficient_one(hours):
     with pytest.raises(InputError, match="give --budget"):
-        plan(hours, 2, SPEED, SIM)
+        fit_plan(hours, 2, SPEED, SIM)

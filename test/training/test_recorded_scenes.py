@@ -1,5 +1,4 @@
-"""Recordings as sources of scenes: what is broken in them, which frames are held out, what is kept,
-and the height of their sensor."""
+"""Recordings as sources of scenes: broken files, splits, cache keys and sensor heights."""
 
 from __future__ import annotations
 
@@ -14,24 +13,24 @@ from detection_samples import tiny, two_objects
 from hypothesis import given
 from hypothesis import strategies as st
 from samples import WALKER, object_folder, walker_label, walker_truth, write
-from training_toy import STILL, broken_folder, keep_all
+from training_toy import STILL, broken_folder, prepare_all
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.geometry import points_in_box
 from lidar_perception.training.data import Batches, Stream
-from lidar_perception.training.frames import drive_split, labelled_frames, random_split
-from lidar_perception.training.pointpillars.task import Preparation
+from lidar_perception.training.frames import draw_drives, draw_items, open_labelled_frames
+from lidar_perception.training.pointpillars.task import ScenePreparation
 from lidar_perception.training.scenes import RecordedScenes
 from lidar_perception.types import PEDESTRIAN, SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 
 seeds = st.integers(0, 2**32 - 1)
 
 
-def test_what_is_broken_is_named_skipped_and_counted(tmp_path, capsys):
+def test_broken_scenes_are_named_skipped_and_counted(tmp_path, capsys):
     root = broken_folder(tmp_path)
-    stream = Stream((labelled_frames(root).scenes(),), keep_all)
+    stream = Stream((open_labelled_frames(root).to_scenes(),), prepare_all)
     batches = Batches(stream, 5)
     steps = batches(0)
     for _ in range(2):
@@ -39,112 +38,112 @@ def test_what_is_broken_is_named_skipped_and_counted(tmp_path, capsys):
     assert len(batches.skipped) == 2
     reasons = sorted(batches.skipped)
     assert "000001.txt:1" in reasons[0] and "000003.bin" in reasons[1]
-    assert capsys.readouterr().err.replace("\n", "").count("skipped:") == 2  # each said once
-    broken = Stream((RecordedScenes(root, ("000001", "000003")),), keep_all)
+    assert capsys.readouterr().err.replace("\n", "").count("skipped:") == 2  # each is printed once
+    broken = Stream((RecordedScenes(root, ("000001", "000003")),), prepare_all)
     with pytest.raises(InputError, match="none of the 2 scenes"):
         broken[0]
 
 
-def test_frames_without_labels_cannot_be_learned_from(tmp_path):
+def test_frame_without_labels_is_refused(tmp_path):
     root = object_folder(tmp_path, count=2)
     (root / "training/label_2/000001.txt").unlink()
     with pytest.raises(InputError, match=r"000001\.bin has no labels"):
         RecordedScenes(root, ("000001",)).scene(0)
 
 
-def test_kitti_scenes_end_with_the_image_unless_asked(tmp_path):
+def test_kitti_scenes_end_with_image_if_view(tmp_path):
     root = object_folder(tmp_path, walker_label() + "\n", 1)
-    ahead, all_of_it = (RecordedScenes(root, ("000000",), view).scene(0) for view in (True, False))
-    assert 0 < len(ahead.points) < len(all_of_it.points)
-    assert (ahead.points[:, 0] > 0).all() and (all_of_it.points[:, 0] < 0).any()
+    ahead, whole = (RecordedScenes(root, ("000000",), view).scene(0) for view in (True, False))
+    assert 0 < len(ahead.points) < len(whole.points)
+    assert (ahead.points[:, 0] > 0).all() and (whole.points[:, 0] < 0).any()
     np.testing.assert_allclose(ahead.boxes[0], WALKER, atol=0.02)
     assert points_in_box(ahead.points[:, :3], ahead.boxes[0]).sum() > 300
 
 
-def test_a_bag_of_a_folder_has_its_scenes(tmp_path):
+def test_bag_of_folder_has_same_scenes(tmp_path):
     folder = object_folder(tmp_path / "kitti", walker_label() + "\n", 2)
     write_bag(tmp_path / "bag", open_recording(folder))
-    of_bag = labelled_frames(tmp_path / "bag").scenes()
-    of_bag.scene(0)  # what it has opened stays here
-    for source in (of_bag, pickle.loads(pickle.dumps(of_bag))):
+    from_bag = open_labelled_frames(tmp_path / "bag").to_scenes()
+    from_bag.scene(0)  # opens files, which are not pickled
+    for source in (from_bag, pickle.loads(pickle.dumps(from_bag))):
         for i in range(2):
-            scene, expected = source.scene(i), labelled_frames(folder).scenes().scene(i)
+            scene, expected = source.scene(i), open_labelled_frames(folder).to_scenes().scene(i)
             assert np.array_equal(scene.points, expected.points) and not scene.around
             np.testing.assert_allclose(scene.boxes, expected.boxes, atol=1e-9)
             assert np.array_equal(scene.class_ids, expected.class_ids)
 
 
-def test_without_a_camera_all_around_is_labelled_and_without_labels_nothing_is_learned(tmp_path):
+def test_scenes_without_camera_are_labelled_all_around(tmp_path):
     frames = [Frame.of("0", LidarFrame(two_objects()[:, :3].copy()), GroundTruth.of([WALKER],
                                                                                    [PEDESTRIAN]))]
     write_bag(tmp_path / "bag", frames)
-    scene = labelled_frames(tmp_path / "bag").scenes().scene(0)
+    scene = open_labelled_frames(tmp_path / "bag").to_scenes().scene(0)
     assert scene.around and np.array_equal(scene.points[:, :3], two_objects()[:, :3])
     assert not scene.points[:, 3].any()  # no intensity
     write_bag(tmp_path / "bare", [Frame.of("0", frames[0].load())])
     with pytest.raises(InputError, match="has no labelled boxes, which train needs"):
-        labelled_frames(tmp_path / "bare")
+        open_labelled_frames(tmp_path / "bare")
 
 
-def test_splits_name_their_frames(tmp_path):
+def test_split_file_selects_frames(tmp_path):
     root = object_folder(tmp_path, count=4)
     split = write(tmp_path / "train.txt", "000003\n000001\n")
-    assert labelled_frames(root, split).scenes().names == ("000003", "000001")
-    assert len(labelled_frames(root).frames) == 4
+    assert open_labelled_frames(root, split).to_scenes().names == ("000003", "000001")
+    assert len(open_labelled_frames(root).frames) == 4
     for text, reason in (("000009", "000009"), ("", "names no frame")):
         with pytest.raises(InputError, match=reason):
-            labelled_frames(root, write(split, text))
+            open_labelled_frames(root, write(split, text))
     with pytest.raises(InputError, match="cannot read the split"):
-        labelled_frames(root, tmp_path / "missing.txt")
+        open_labelled_frames(root, tmp_path / "missing.txt")
 
 
 @given(st.lists(st.integers(1, 60), min_size=1, max_size=8).filter(lambda n: sum(n) > 1),
        st.floats(0, 1), seeds)
-def test_a_share_is_held_out_by_the_seed_and_of_drives_whole_ones_and_the_end_of_one(
+def test_share_is_held_out_as_whole_drives_and_one_end(
         lengths, share, seed):
     ends = np.cumsum(lengths)
     drives = [range(end - length, end) for end, length in zip(ends, lengths)]
-    for split, items in (random_split, range(ends[-1])), (drive_split, drives):
-        held = split(items, share, seed)
-        assert held == split(items, share, seed) and len(set(held)) == len(held)
-        assert 0 < len(held) < ends[-1] and abs(len(held) - share * ends[-1]) <= 1
-    pieces = [sorted(set(held) & set(drive)) for drive in drives]  # of drive_split
+    for draw, items in (draw_items, range(ends[-1])), (draw_drives, drives):
+        held_out = draw(items, share, seed)
+        assert held_out == draw(items, share, seed) and len(set(held_out)) == len(held_out)
+        assert 0 < len(held_out) < ends[-1] and abs(len(held_out) - share * ends[-1]) <= 1
+    pieces = [sorted(set(held_out) & set(drive)) for drive in drives]  # of draw_drives
     cut = [(piece, drive) for piece, drive in zip(pieces, drives) if 0 < len(piece) < len(drive)]
     assert len(cut) <= 1 and all(piece == [*drive[-len(piece):]] for piece, drive in cut)
 
 
 def test_one_frame_cannot_be_split():
-    for split, items in (random_split, ["000000"]), (drive_split, [["000000"]]):
+    for draw, items in (draw_items, ["000000"]), (draw_drives, [["000000"]]):
         with pytest.raises(InputError, match="--val"):
-            split(items, 0.5, 0)
+            draw(items, 0.5, 0)
 
 
-def test_of_a_drive_the_end_that_is_labelled_is_held_out(tmp_path):
+def test_labelled_end_of_drive_is_held_out(tmp_path):
     frames = [Frame.of(str(i), replace(LidarFrame(two_objects()[:, :3].copy()), stamp_ns=i * 10**8),
                        walker_truth() if i < 8 else None) for i in range(10)]
     write_bag(tmp_path / "bag", frames)
-    learned, held = labelled_frames(tmp_path / "bag").held_out(0.25, 0)
-    assert [frame.stamp_ns // 10**8 for frame in held.frames] == [6, 7]
-    assert len(learned.frames) == 8
+    training, held_out = open_labelled_frames(tmp_path / "bag").split(0.25, 0)
+    assert [frame.stamp_ns // 10**8 for frame in held_out.frames] == [6, 7]
+    assert len(training.frames) == 8
 
 
-def test_what_is_kept_of_a_recording_is_made_again_once_its_files_are_others(tmp_path, monkeypatch):
+def test_cache_key_changes_with_files_and_height(tmp_path, monkeypatch):
     root = object_folder(tmp_path / "kitti", walker_label() + "\n", 2)
-    keys = [labelled_frames(root).scenes().key(i) for i in range(2)]
+    keys = [open_labelled_frames(root).to_scenes().key(i) for i in range(2)]
     monkeypatch.chdir(tmp_path)
-    assert labelled_frames(Path("kitti/training")).scenes().key(0) == keys[0] != keys[1]
+    assert open_labelled_frames(Path("kitti/training")).to_scenes().key(0) == keys[0] != keys[1]
     write(root / "training/label_2/000000.txt", "")
-    now = labelled_frames(root).scenes()
+    now = open_labelled_frames(root).to_scenes()
     assert now.key(0) != keys[0] and now.key(1) == keys[1]
-    assert labelled_frames(root, height=0.6).scenes().key(1) != keys[1]
+    assert open_labelled_frames(root, height=0.6).to_scenes().key(1) != keys[1]
     write_bag(tmp_path / "bag", open_recording(root))
-    key = labelled_frames(tmp_path / "bag").scenes().key(0)
+    key = open_labelled_frames(tmp_path / "bag").to_scenes().key(0)
     os.utime(next((tmp_path / "bag").glob("*.mcap")), ns=(0, 0))
-    assert labelled_frames(tmp_path / "bag").scenes().key(0) != key
+    assert open_labelled_frames(tmp_path / "bag").to_scenes().key(0) != key
 
 
 def low_bag(path: Path, height: float, count: int = 2) -> Path:
-    """Level ground that far below the sensor, and a person on it."""
+    """Write a bag with level ground `height` metres below the sensor, and a person on it."""
     rng = np.random.default_rng(0)
     ground = rng.uniform(-20, 20, (6000, 3)) * [1, 1, 5e-4] - [0, 0, height]
     person = rng.uniform(-0.25, 0.25, (300, 3)) * [1, 1, 3.4] + [8, 0.5, 0.85 - height]
@@ -155,18 +154,19 @@ def low_bag(path: Path, height: float, count: int = 2) -> Path:
     return path
 
 
-def test_a_recording_is_brought_to_the_height_that_the_network_knows(tmp_path):
+def test_samples_do_not_depend_on_sensor_height(tmp_path):
     config, samples = tiny(), []
     for height in SENSOR_HEIGHT, 0.6:
-        source = labelled_frames(low_bag(tmp_path / f"{height}", height)).scenes()
+        source = open_labelled_frames(low_bag(tmp_path / f"{height}", height)).to_scenes()
         again = pickle.loads(pickle.dumps(source))
         assert again.sensor_height == again.scene(0).height == again.frame(1).sensor_height
         assert again.sensor_height == pytest.approx(height, abs=0.011)
-        samples.append(Preparation(config, STILL)(source.scene(0), np.random.default_rng(0)))
+        samples.append(ScenePreparation(config, STILL)(source.scene(0), np.random.default_rng(0)))
     assert len(samples[0].points) == len(samples[1].points)
     assert np.allclose(samples[0].boxes, samples[1].boxes, atol=0.011)
     path = tmp_path / "0.6"
-    assert labelled_frames(path, height=1.1, mixed=True).scenes().scene(0).height == 1.1
+    assert open_labelled_frames(path, height=1.1, mixed=True).to_scenes().scene(0).height == 1.1
     folder = object_folder(tmp_path / "kitti", walker_label() + "\n", 1)
-    assert labelled_frames(folder, height=1.1).scenes().scene(0).height == 1.1
-    assert labelled_frames(folder, height=1.1, mixed=True).scenes().scene(0).height == SENSOR_HEIGHT
+    assert open_labelled_frames(folder, height=1.1).to_scenes().scene(0).height == 1.1
+    mixed = open_labelled_frames(folder, height=1.1, mixed=True).to_scenes()
+    assert mixed.scene(0).height == SENSOR_HEIGHT

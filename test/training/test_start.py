@@ -1,4 +1,4 @@
-"""Laws of how a training starts: what is refused, planned, kept, and resumed after a kill."""
+"""Start of a training: refused input, the plan, preparation, and resuming after a kill."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.runs import terminal
 from lidar_perception.runs.resuming import locked
-from lidar_perception.training import start as start_module
-from lidar_perception.training.out import RUN, STATE, alone
+from lidar_perception.training import planning, start
+from lidar_perception.training.run_directory import RUN, STATE, RunDirectory
 from lidar_perception.types import SENSOR_HEIGHT, InputError
 
 pytestmark = pytest.mark.usefixtures("streets")
 SENSOR = "generic:16,-20,5,2,10"
 
 
-def words(out: Path, *more: str) -> list[str]:
-    """A training that is small in every way."""
+def small_training(out: Path, *more: str) -> list[str]:
+    """Return the arguments of a training that is small in every way."""
     return ["train", "pointpillars", "--version", "v0", "--ahead", "10", "--aside", "10", "--data",
             "sim", "--data-people", "3", "--sensor", SENSOR, "--data-scans", "6",
             "--data-val-scans", "1", "--steps", "4", "--validate-steps", "4", "--save-steps", "1",
             "--batch", "1", "--jobs", "0", "--out", str(out), *more]
 
 
-def killed_when(condition, *arguments: str) -> None:
-    """Begin a training in a copy of this process, which has torch already, and kill it when
-    condition() holds."""
+def kill_when(condition, *arguments: str) -> None:
+    """Begin a training in a copy of this process, which has imported torch, and kill it when
+    condition() is true."""
     process = multiprocessing.get_context("fork").Process(target=cli.main, args=(arguments,))
     process.start()
     end = time.monotonic() + 240
@@ -51,36 +51,35 @@ def killed_when(condition, *arguments: str) -> None:
 
 
 def tensors(out: Path) -> bytes:
-    """All but the header, which says how long it took."""
+    """Return the tensors without the header, which contains durations."""
     content = (out / "last.safetensors").read_bytes()
     return content[8 + int.from_bytes(content[:8], "little"):]
 
 
-def test_killed_in_the_preparation_and_in_the_steps_it_ends_as_if_it_had_not_been(
-        tmp_path, one_thread):
+def test_run_killed_twice_equals_unbroken_run(tmp_path, one_thread):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    unbroken = CliRunner().invoke(cli, words(whole, "--jobs", "2"))
+    unbroken = CliRunner().invoke(cli, small_training(whole, "--jobs", "2"))
     assert unbroken.exit_code == 0, unbroken.exception
     lines = unbroken.stderr.splitlines()
     assert "6 street scans of generic" in lines[1] and "4 steps of 1 scenes" in lines[1]
     assert "simulating" in lines[2] and "validation" in lines[2]
 
     scans = broken / "scans"
-    killed_when(lambda: len(list(scans.glob("*.npz"))) >= 2, *words(broken))
+    kill_when(lambda: len(list(scans.glob("*.npz"))) >= 2, *small_training(broken))
     assert not (broken / STATE).exists()
     before = {path: path.stat().st_mtime_ns for path in scans.rglob("*.npz")}
-    refused = CliRunner().invoke(cli, words(broken))
+    refused = CliRunner().invoke(cli, small_training(broken))
     assert isinstance(refused.exception, InputError) and "--resume" in str(refused.exception)
-    killed_when((broken / STATE).exists, *words(broken, "--resume"))
+    kill_when((broken / STATE).exists, *small_training(broken, "--resume"))
     assert {path: path.stat().st_mtime_ns for path in before} == before  # not made again
-    assert CliRunner().invoke(cli, words(broken, "--resume")).exit_code == 0
+    assert CliRunner().invoke(cli, small_training(broken, "--resume")).exit_code == 0
     assert tensors(broken) == tensors(whole)
     kept = {path.relative_to(broken): path.read_bytes() for path in broken.rglob("*.npz")}
     assert kept == {path.relative_to(whole): path.read_bytes() for path in whole.rglob("*.npz")}
 
 
 def refuse(tmp_path: Path, *more: str) -> str:
-    """What the command says in one line of input that it refuses; nothing is made."""
+    """Return the one-line error for refused input; nothing may be written."""
     result = CliRunner().invoke(cli, ["train", "pointnet", "--data", "sim", "--out",
                                       str(tmp_path / "run"), *more])
     assert result.exception is not None and not isinstance(result.exception, SystemExit)
@@ -90,30 +89,30 @@ def refuse(tmp_path: Path, *more: str) -> str:
     return line
 
 
-def test_a_run_is_written_by_one_process_at_a_time(tmp_path):
+def test_run_directory_is_locked(tmp_path):
     with locked(tmp_path / "run"):
         assert "another process" in refuse(tmp_path, "--resume", "--sensor", SENSOR)
 
 
 @pytest.mark.parametrize("more", [[], ["--resume"]])
-def test_weights_of_no_run_in_out_are_not_replaced(tmp_path, more):
+def test_foreign_weights_in_out_are_not_replaced(tmp_path, more):
     weights = tmp_path / "run/best.safetensors"
     weights.parent.mkdir()
     shutil.copy(weights_file(PointNetParams()), weights)
     assert "would be replaced" in refuse(tmp_path, "--init", str(weights), *more)
 
 
-def test_only_what_a_killed_run_was_writing_is_removed(tmp_path):
+def test_only_temporary_files_of_killed_run_are_removed(tmp_path):
     ours = [".last.pt.7-1.tmp", "scans/.ab.npz.7-1.tmp", "scans/clusters/.ab.npz.7-2.tmp"]
     theirs = ["notes/.draft.tmp", ".draft.tmp", ".draft.7-1.tmp", "notes/.last.pt.7-1.tmp"]
     for name in (*ours, *theirs):
         write(tmp_path / name, "half")
-    with alone(tmp_path):
+    with RunDirectory(tmp_path).lock():
         assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.tmp")} == {*theirs}
 
 
 @pytest.mark.parametrize("hours", ["0", "-1", "nan", "inf"])
-def test_a_budget_that_is_none_is_refused(hours, tmp_path):
+def test_bad_budget_is_refused(hours, tmp_path):
     assert "--budget" in refuse(tmp_path, "--budget", hours)
 
 
@@ -122,46 +121,46 @@ def test_a_budget_that_is_none_is_refused(hours, tmp_path):
     ("elevations: [3]\nazimuth_step: 0\nrate: 10\n", "azimuth_step"),
     ("beams: 4\n", "beams"),
 ])
-def test_a_sensor_that_cannot_be_is_refused(content, reason, tmp_path):
+def test_bad_sensor_file_is_refused(content, reason, tmp_path):
     path = write(tmp_path / "robot.yaml", content)
     assert reason in refuse(tmp_path, "--sensor", str(path))
 
 
-def test_a_mount_that_cannot_be_is_refused(tmp_path):
+def test_bad_mount_height_is_refused(tmp_path):
     assert "mount_height" in refuse(tmp_path, "--mount-height", "-1")
 
 
-def test_a_disk_without_room_is_refused_before_anything_is_simulated(tmp_path, monkeypatch):
+def test_full_disk_is_refused_before_simulation(tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(start_module.shutil, "disk_usage",
+    monkeypatch.setattr(planning.shutil, "disk_usage",
                         lambda _: usage._replace(free=5 * 10**8))
     line = refuse(tmp_path, "--sensor", SENSOR, "--data-scans", "1000", "--steps", "1")
     assert "GB are free" in line and "--data-scans" in line
 
 
-def test_the_plan_is_kept_and_other_settings_are_no_resumed_run(tmp_path, one_thread):
+def test_resumed_run_keeps_plan_and_refuses_other_settings(tmp_path, one_thread):
     out = tmp_path / "run"
     sensor = write(tmp_path / "robot.yaml",
                    "elevations: [2, -3, -8, -13, -18]\nazimuth_step: 1.5\nrate: 10\nheight: 0.9\n")
-    asked = ["train", "pointnet", "--data", "sim", "--sensor", str(sensor), "--data-scans", "2",
-             "--data-val-scans", "1", "--steps", "2", "--batch", "1", "--jobs", "0", "--init",
-             "package", "--out", str(out)]
-    assert CliRunner().invoke(cli, [*asked, "--mount-height", "0.6"]).exit_code == 0
-    said = read_header(out / "last.safetensors").training
-    assert said["sensor"] == {"name": str(sensor), "height": 0.6, "beams": 5}
+    arguments = ["train", "pointnet", "--data", "sim", "--sensor", str(sensor), "--data-scans", "2",
+                 "--data-val-scans", "1", "--steps", "2", "--batch", "1", "--jobs", "0", "--init",
+                 "package", "--out", str(out)]
+    assert CliRunner().invoke(cli, [*arguments, "--mount-height", "0.6"]).exit_code == 0
+    record = read_header(out / "last.safetensors").training
+    assert record["sensor"] == {"name": str(sensor), "height": 0.6, "beams": 5}
     header = read_header(out / "last.safetensors")
     assert header.unlike(0.7) is None and "at 0.6 m, and used with one at 1.73 m" in header.unlike(
         1.73)
     plan = json.loads((out / RUN).read_text())["plan"]
     assert (plan["scans"], plan["steps"]) == (2, 2)
-    other = CliRunner().invoke(cli, [*asked, "--resume"])
+    other = CliRunner().invoke(cli, [*arguments, "--resume"])
     assert "0.9" in str(other.exception) and "0.6" in str(other.exception)
-    again = [*asked, "--mount-height", "0.6", "--resume", "--budget", "7"]
+    again = [*arguments, "--mount-height", "0.6", "--resume", "--budget", "7"]
     assert CliRunner().invoke(cli, again).exit_code == 0
 
 
 def small_run(kind: str, out: Path, root: Path, *more: str):
-    """A step on a folder of KITTI, validated."""
+    """Train one step on a KITTI folder and validate."""
     return CliRunner().invoke(cli, ["train", kind, *(("--version", "v0", "--ahead", "10", "--aside",
                                     "10") if kind == "pointpillars" else ()), "--data", str(root),
                                     "--steps", "1", "--batch", "1", "--jobs", "0", "--out",
@@ -169,9 +168,8 @@ def small_run(kind: str, out: Path, root: Path, *more: str):
 
 
 @pytest.mark.parametrize("kind", ["pointpillars", "pointnet"])
-def test_what_cannot_be_used_is_passed_over_wherever_it_lies(kind, tmp_path, one_thread):
-    """The first scene to train on, and the first frames to validate on: cut, without a label, with
-    nothing in it."""
+def test_unusable_first_scenes_are_skipped(kind, tmp_path, one_thread):
+    """The first scenes are truncated, without a label file, or empty."""
     root = object_folder(tmp_path / "kitti", walker_label() + "\n", 6) / "training"
     for number in (0, 2):
         write(root / f"velodyne/{number:06}.bin", b"cut")
@@ -193,42 +191,41 @@ def test_what_cannot_be_used_is_passed_over_wherever_it_lies(kind, tmp_path, one
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("part", ["_settle", "_prepare"])
-def test_a_preparation_that_is_stopped_says_how_it_goes_on(tmp_path, monkeypatch, part, number):
+@pytest.mark.parametrize("part", ["_make_plan", "_prepare_scenes"])
+def test_stopped_preparation_explains_resume(tmp_path, monkeypatch, part, number):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # as in test_training.py
-    monkeypatch.setattr(start_module, part, lambda *_: signal.raise_signal(number))
+    monkeypatch.setattr(start, part, lambda *_: signal.raise_signal(number))
     try:
-        result = CliRunner().invoke(cli, words(tmp_path / "run"))
+        result = CliRunner().invoke(cli, small_training(tmp_path / "run"))
     finally:
         signal.signal(signal.SIGINT, before)
-    assert result.exit_code == 130 and "--resume goes on" in result.stderr
+    assert result.exit_code == 130 and "continue with --resume" in result.stderr
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-def test_a_run_is_not_resumed_with_other_frames_or_weights_under_the_same_names(tmp_path,
-                                                                                monkeypatch):
+def test_run_is_not_resumed_with_changed_split_or_weights(tmp_path, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(start_module, "_prepare", stop)
+    monkeypatch.setattr(start, "_prepare_scenes", stop)
     split = write(tmp_path / "split.txt", "000000\n000001\n000002\n")
     init = Path(shutil.copy(weights_file(PointNetParams()), tmp_path / "init.safetensors"))
-    asked = ["train", "pointnet", "--data", str(object_folder(tmp_path / "kitti", count=5)),
-             "--split", str(split), "--init", str(init), "--steps", "2", "--jobs", "0",
-             "--out", str(tmp_path / "run"), "--resume"]
+    arguments = ["train", "pointnet", "--data", str(object_folder(tmp_path / "kitti", count=5)),
+                 "--split", str(split), "--init", str(init), "--steps", "2", "--jobs", "0",
+                 "--out", str(tmp_path / "run"), "--resume"]
 
-    def said() -> str:
-        return str(CliRunner().invoke(cli, asked).exception)
+    def resume() -> str:
+        return str(CliRunner().invoke(cli, arguments).exception)
 
-    assert "holds a run" not in said() + said()
+    assert "holds a run" not in resume() + resume()
     write(split, "000000\n000001\n000003\n")
-    assert "frame_names" in said() and "init" not in said()
+    assert "frame_names" in resume() and "init" not in resume()
     write(split, "000000\n000001\n000002\n")
     save_header(init, replace(read_header(init), commit="another"))
-    assert "init_weights" in said() and "frame" not in said()
+    assert "init_weights" in resume() and "frame" not in resume()
 
 
-def test_where_there_is_no_terminal_progress_comes_line_by_line(monkeypatch, capsys):
+def test_progress_without_terminal_prints_lines(monkeypatch, capsys):
     monkeypatch.setattr(terminal, "EVERY", 0.0)
     assert list(terminal.track(iter("abc"), "cutting", 3)) == ["a", "b", "c"]
     lines = capsys.readouterr().err.splitlines()

@@ -1,4 +1,4 @@
-"""train pointnet from the command line."""
+"""train pointnet on the command line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training.params import PointNetTraining
 from lidar_perception.types import InputError
 
-# Others run these lines.
+# covered by other tests
 pytestmark = [pytest.mark.no_cover,
               pytest.mark.usefixtures("one_thread", "streets")]
 SENSOR = "generic:16,-20,5,1.5,10"
@@ -26,7 +26,7 @@ SENSOR = "generic:16,-20,5,1.5,10"
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
-    """Simulated scans and their clusters are made once for all tests."""
+    """Folder of simulated scans and clusters that all tests share."""
     return tmp_path_factory.mktemp("cache")
 
 
@@ -38,7 +38,7 @@ def train(cache, out, *more, **changes):
     return CliRunner().invoke(cli, ["train", "pointnet", *words, *more])
 
 
-def test_a_network_is_trained_on_clusters_and_finds_its_way_into_the_detector(cache, tmp_path):
+def test_trained_network_opens_as_detector(cache, tmp_path):
     out = tmp_path / "run"
     result = train(cache, out)
     assert result.exit_code == 0, result.output
@@ -50,7 +50,7 @@ def test_a_network_is_trained_on_clusters_and_finds_its_way_into_the_detector(ca
     json.loads(header.text())
     assert network.offsets.abs().sum() > 0  # calibrated
     open_detector(out / "last.safetensors", "cpu")(scan_at(3, 0, sensor_named(SENSOR)).frame)
-    # the same seed, the same weights, from the cache too; an interrupted run goes on
+    # the same seed gives the same weights, also from the cache
     again = train(cache, tmp_path / "again")
     assert again.exit_code == 0
     assert _weights(tmp_path / "again") == _weights(out)
@@ -64,7 +64,7 @@ def _weights(out):
     return {name: value.tolist() for name, value in network.state_dict().items()}
 
 
-def test_a_judge_is_trained_on_what_a_pointpillars_proposes(cache, tmp_path):
+def test_proposer_is_recorded_and_must_be_pointpillars(cache, tmp_path):
     result = train(cache, tmp_path / "run", **{"--proposer": "package"})
     assert result.exit_code == 0, result.output
     training = read_header(tmp_path / "run/last.safetensors").training
@@ -75,6 +75,6 @@ def test_a_judge_is_trained_on_what_a_pointpillars_proposes(cache, tmp_path):
         assert not (tmp_path / "bad").exists()
 
 
-def test_every_network_can_be_asked_for():
-    said = PointNetTraining.__dataclass_fields__["network"].metadata
-    assert set(NETWORKS) == set(said["choices"])
+def test_option_network_offers_every_network():
+    metadata = PointNetTraining.__dataclass_fields__["network"].metadata
+    assert set(NETWORKS) == set(metadata["choices"])

@@ -1,4 +1,4 @@
-"""Laws of augmentation, and of objects that are put into other scenes."""
+"""Augmentation of scenes, and objects pasted into other scenes."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from hypothesis import strategies as st
 
 from lidar_perception.geometry import bev_iou, points_in_box, wrap_angle
 from lidar_perception.training.augment import (
-    STEP,
+    BEAM_STEP,
     TrainingScene,
-    augmented,
-    blurred,
-    brightened,
-    cropped,
-    faced,
-    flipped,
-    raised,
-    scaled,
-    thinned,
-    turned,
-    with_moved_objects,
+    augment_scene,
+    blur_ranges,
+    change_intensity,
+    crop_scene,
+    drop_points,
+    flip_scene,
+    move_objects,
+    raise_scene,
+    scale_scene,
+    turn_and_crop,
+    turn_scene,
 )
-from lidar_perception.training.cut_objects import cut, joined
-from lidar_perception.training.database import THING, Database, varied_thing, with_objects
+from lidar_perception.training.cut_objects import cut_objects, join_databases
+from lidar_perception.training.database import THING, Database, paste_objects, vary_boxed_thing
 from lidar_perception.training.params import AugmentParams
-from lidar_perception.training.putting import inside
+from lidar_perception.training.pasting import find_points_in_box
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 
 AREA = np.array([0.0, -15, -3]), np.array([20.0, 15, 1])
@@ -40,7 +40,7 @@ STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0
 
 
 def random_scene(seed: int, around: bool = False) -> TrainingScene:
-    """Ground, and up to a dozen boxes full of points that do not touch."""
+    """Return ground with up to twelve boxes of points that do not touch."""
     rng = np.random.default_rng(seed)
     boxes, ids = np.zeros((0, 7)), []
     for _ in range(rng.integers(0, 13)):
@@ -60,51 +60,52 @@ def random_scene(seed: int, around: bool = False) -> TrainingScene:
 
 
 def members(scene: TrainingScene, margin: float = 0.0) -> np.ndarray:
-    """(M, N) bool: which points are in which box."""
+    """Return (M, N) bool: which points are in which box."""
     return np.array([points_in_box(scene.points[:, :3], box, margin) for box in scene.boxes],
                     bool).reshape(len(scene.boxes), len(scene.points))
 
 
-def touching(boxes: np.ndarray) -> bool:
+def any_touch(boxes: np.ndarray) -> bool:
     return bool((bev_iou(boxes, boxes) - np.eye(len(boxes)) > 1e-9).any())
 
 
 @given(seeds, st.floats(0, 0.5))
-def test_points_inside_a_box_are_found_as_by_the_plain_way(seed, margin):
+def test_find_points_in_box_agrees_with_points_in_box(seed, margin):
     scene = random_scene(seed)
     for box in scene.boxes:
         plain = points_in_box(scene.points[:, :3], box, margin)
-        assert np.array_equal(inside(scene.points, box, margin), np.flatnonzero(plain))
+        assert np.array_equal(find_points_in_box(scene.points, box, margin), np.flatnonzero(plain))
 
 
 # augmentation
 
 @given(seeds)
-def test_points_in_a_box_stay_in_it(seed):
+def test_points_stay_in_their_boxes(seed):
     scene, rng = random_scene(seed), np.random.default_rng(seed)
     before = members(scene)
-    for changed in (flipped(scene), turned(scene, rng.uniform(-4, 4)),
-                    scaled(scene, rng.uniform(0.8, 1.2)), raised(scene, rng.uniform(-1, 1)),
-                    brightened(scene, rng.uniform(0.5, 1.5), rng.uniform(-0.3, 0.3)),
-                    with_moved_objects(scene, 0.5, 0.5, rng)):
+    for changed in (flip_scene(scene), turn_scene(scene, rng.uniform(-4, 4)),
+                    scale_scene(scene, rng.uniform(0.8, 1.2)),
+                    raise_scene(scene, rng.uniform(-1, 1)),
+                    change_intensity(scene, rng.uniform(0.5, 1.5), rng.uniform(-0.3, 0.3)),
+                    move_objects(scene, 0.5, 0.5, rng)):
         assert changed.points.dtype == np.float32 and changed.points.shape == scene.points.shape
         assert not (before & ~members(changed, margin=2e-4)).any()
         np.testing.assert_allclose(changed.boxes[:, 3:6] / scene.boxes[:, 3:6],
                                    (changed.boxes[:1, 3:4] / scene.boxes[:1, 3:4]).sum() or 1)
-        assert touching(changed.boxes) is False
+        assert any_touch(changed.boxes) is False
 
 
 @given(seeds)
-def test_whole_scenes_move_as_one(seed):
+def test_points_and_boxes_move_together(seed):
     scene = random_scene(seed)
-    for changed in flipped(scene), turned(scene, 2.0), raised(scene, 0.4):
+    for changed in flip_scene(scene), turn_scene(scene, 2.0), raise_scene(scene, 0.4):
         assert np.array_equal(members(changed, 1e-3).sum(axis=1), members(scene, 1e-3).sum(axis=1))
 
 
 @given(seeds, st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
-def test_on_a_slope_everything_is_as_high_above_the_ground_as_before(seed, ahead, aside):
+def test_slope_keeps_heights_above_ground(seed, ahead, aside):
     scene = random_scene(seed)
-    tilted = raised(scene, 0.3, (ahead, aside))
+    tilted = raise_scene(scene, 0.3, (ahead, aside))
     for before, after in ((scene.points, tilted.points), (scene.boxes, tilted.boxes)):
         np.testing.assert_allclose(after[:, 2] - 0.3 - after[:, :2] @ [ahead, aside], before[:, 2],
                                    atol=1e-5)
@@ -112,28 +113,28 @@ def test_on_a_slope_everything_is_as_high_above_the_ground_as_before(seed, ahead
 
 
 @given(seeds, st.floats(-7, 7))
-def test_changes_are_undone_by_their_inverses(seed, angle):
+def test_inverse_changes_restore_scene(seed, angle):
     scene = random_scene(seed)
-    for back in (flipped(flipped(scene)), turned(turned(scene, angle), -angle),
-                 scaled(scaled(scene, 1.25), 0.8),
-                 raised(raised(scene, 0.5, (0.02, -0.01)), -0.5, (-0.02, 0.01))):
+    for back in (flip_scene(flip_scene(scene)), turn_scene(turn_scene(scene, angle), -angle),
+                 scale_scene(scale_scene(scene, 1.25), 0.8),
+                 raise_scene(raise_scene(scene, 0.5, (0.02, -0.01)), -0.5, (-0.02, 0.01))):
         np.testing.assert_allclose(back.points, scene.points, atol=1e-4)
         np.testing.assert_allclose(back.boxes[:, :6], scene.boxes[:, :6], atol=1e-9)
         np.testing.assert_allclose(wrap_angle(back.boxes[:, 6] - scene.boxes[:, 6]), 0, atol=1e-9)
 
 
-def test_a_turn_takes_what_is_ahead_to_the_left():
+def test_turn_is_counter_clockwise():
     scene = TrainingScene(np.array([[5, 0, 1, 0.5]], np.float32),
                           np.array([[5.0, 0, 1, 4, 2, 1, 0.1]]), np.array([CAR]), np.ones(1, bool))
-    changed = turned(scene, np.pi / 2)
+    changed = turn_scene(scene, np.pi / 2)
     np.testing.assert_allclose(changed.points, [[0, 5, 1, 0.5]], atol=1e-6)
     np.testing.assert_allclose(changed.boxes, [[0, 5, 1, 4, 2, 1, 0.1 + np.pi / 2]], atol=1e-9)
 
 
 @given(seeds, st.floats(0, 0.99))
-def test_thinning_leaves_a_part_of_the_points_in_their_order(seed, share):
+def test_drop_points_keeps_share_and_order(seed, share):
     scene = random_scene(seed)
-    left = thinned(scene, share, np.random.default_rng(seed))
+    left = drop_points(scene, share, np.random.default_rng(seed))
     assert (len(left.points) == len(scene.points)) or share > 0
     assert abs(len(left.points) - (1 - share) * len(scene.points)) < 6 * len(scene.points)**0.5
     places = iter(scene.points.tolist())
@@ -141,66 +142,67 @@ def test_thinning_leaves_a_part_of_the_points_in_their_order(seed, share):
 
 
 @given(seeds)
-def test_intensities_stay_intensities_and_nothing_else_changes(seed):
+def test_intensity_stays_within_0_and_1_and_0_stays_0(seed):
     scene = random_scene(seed)
-    changed = brightened(scene, 1.4, 0.2)
+    changed = change_intensity(scene, 1.4, 0.2)
     assert changed.points[:, 3].min() >= 0 and changed.points[:, 3].max() <= 1
     assert np.array_equal(changed.points[:, :3], scene.points[:, :3])
-    scene.points[::2, 3] = 0  # what was too weak to be told
-    assert (brightened(scene, 1.4, 0.2).points[::2, 3] == 0).all()
+    scene.points[::2, 3] = 0  # returns too weak to have an intensity
+    assert (change_intensity(scene, 1.4, 0.2).points[::2, 3] == 0).all()
 
 
 @given(seeds, st.booleans())
-def test_the_same_rng_gives_the_same_scene_and_zeros_change_nothing(seed, around):
+def test_augmentation_is_deterministic_and_zeros_do_nothing(seed, around):
     scene = random_scene(seed, around)
     kept = scene.points.copy(), scene.boxes.copy()
-    once, twice = (augmented(scene, AugmentParams(), np.random.default_rng(seed)) for _ in "ab")
+    once, twice = (augment_scene(scene, AugmentParams(), np.random.default_rng(seed)) for _ in "ab")
     assert np.array_equal(once.points, twice.points) and np.array_equal(once.boxes, twice.boxes)
     assert np.array_equal(scene.points, kept[0]) and np.array_equal(scene.boxes, kept[1])
-    same = augmented(scene, STILL, np.random.default_rng(seed))
+    same = augment_scene(scene, STILL, np.random.default_rng(seed))
     np.testing.assert_allclose(same.points, scene.points, atol=1e-5)
     np.testing.assert_allclose(same.boxes, scene.boxes, atol=1e-9)
 
 
-# objects of other scenes
+# pasted objects
 
 @given(seeds)
-def test_objects_that_are_put_in_touch_nothing_and_keep_their_points(seed):
-    database = joined([cut(random_scene(seed + k), ("Car", "Pedestrian", "Cyclist"), 5)
-                       for k in range(1, 6)])
+def test_pasted_objects_touch_nothing_and_keep_points(seed):
+    database = join_databases([
+        cut_objects(random_scene(seed + k), ("Car", "Pedestrian", "Cyclist"), 5)
+        for k in range(1, 6)])
     scene, rng = random_scene(seed), np.random.default_rng(seed)
     params = AugmentParams(cars=4, pedestrians=4, cyclists=0)
-    fuller = with_objects(scene, database, params, *AREA, rng)
+    fuller = paste_objects(scene, database, params, *AREA, rng)
     old, count = len(scene.boxes), len(fuller.boxes)
-    assert not touching(fuller.boxes)
+    assert not any_touch(fuller.boxes)
     assert np.array_equal(fuller.boxes[:old], scene.boxes)
     assert len(fuller.class_ids) == len(fuller.wanted) == count
     for kind, most in ((CAR, 4), (PEDESTRIAN, 4), (CYCLIST, 0)):
-        here = (fuller.class_ids == kind).sum()
-        assert here <= max(most, (scene.class_ids == kind).sum())
+        present = (fuller.class_ids == kind).sum()
+        assert present <= max(most, (scene.class_ids == kind).sum())
     within = members(fuller, 1e-3).sum(axis=1)
-    assert (within[:old] <= members(scene, 1e-3).sum(axis=1)).all()  # some may be in a shadow now
+    assert (within[:old] <= members(scene, 1e-3).sum(axis=1)).all()  # some may be in a shadow
     sizes = np.diff(database.first)
     ranges = np.hypot(database.boxes[:, 0], database.boxes[:, 1])
     for box, number in zip(fuller.boxes[old:], within[old:]):
         assert (box[:2] >= AREA[0][:2]).all() and (box[:2] < AREA[1][:2]).all()
         origin = np.abs(ranges - np.hypot(box[0], box[1])).argmin()
         assert ranges[origin] == pytest.approx(np.hypot(box[0], box[1]), abs=1e-9)
-        assert number <= sizes[origin] and sizes[origin] >= 5  # the next one may stand before it
-    again = with_objects(scene, database, params, *AREA, np.random.default_rng(seed))
+        assert number <= sizes[origin] and sizes[origin] >= 5  # another may hide it
+    again = paste_objects(scene, database, params, *AREA, np.random.default_rng(seed))
     assert np.array_equal(again.points, fuller.points)
 
 
 def wall(x: float, y: tuple[float, float], z: tuple[float, float], apart: float = 0.02
          ) -> np.ndarray:
-    """(N, 4) points."""
+    """Return the points (N, 4) of a wall across the x axis."""
     sides, heights = np.meshgrid(np.arange(*y, apart), np.arange(*z, apart))
     return np.column_stack([np.full(sides.size, x), sides.ravel(), heights.ravel(),
                             np.zeros(sides.size)]).astype(np.float32)
 
 
 def one_walker(x: float) -> Database:
-    """A pedestrian x metres ahead, a flat grid of points."""
+    """Return a pedestrian x metres ahead, a flat grid of points."""
     own = wall(x, (-0.25, 0.25), (-1.7, 0))
     return Database(np.array([[x, 0, -0.86, 0.8, 0.7, 1.74, 0]]),
                     np.array([PEDESTRIAN], np.int32), own, np.array([0, len(own)]))
@@ -214,11 +216,11 @@ def street_with(*walls: np.ndarray) -> TrainingScene:
 
 @given(seeds)
 @pytest.mark.no_cover
-def test_what_is_behind_an_object_goes_and_none_is_put_behind_something(seed):
+def test_pasted_object_casts_shadow_and_is_not_hidden(seed):
     params, rng = AugmentParams(cars=0, pedestrians=1, cyclists=0), np.random.default_rng(seed)
     behind = wall(12.0, (-14, 14), (-1.7, 1.0), 0.06)
     scene = street_with(behind)
-    fuller = with_objects(scene, one_walker(8.0), params, *AREA, rng)
+    fuller = paste_objects(scene, one_walker(8.0), params, *AREA, rng)
     assert len(fuller.boxes) == 1
     box = fuller.boxes[0]
     assert np.hypot(box[0], box[1]) == pytest.approx(8.0)
@@ -226,30 +228,30 @@ def test_what_is_behind_an_object_goes_and_none_is_put_behind_something(seed):
     rest, own = fuller.points[:-count], fuller.points[-count:]
     assert points_in_box(own, box, 1e-4).all()
     seen = rest[(rest[:, 0] == 12) & (rest[:, 2] > -1.72)]
-    # a ray from the sensor to a point of the wall that is left misses the walker
+    # rays from the sensor to the remaining points of the wall miss the walker
     for share in np.linspace(0.5, 0.95, 40):
         assert not points_in_box(seen * np.float32(share), box - [0, 0, 0, 0.35, 0.3, 0.1, 0]).any()
     assert len(seen) > 0.8 * len(behind)
     if abs(np.arctan2(box[1], box[0])) < 0.6:
         assert len(seen) < len(behind)
-    hidden = with_objects(scene, one_walker(14.0), params, *AREA, rng)
+    hidden = paste_objects(scene, one_walker(14.0), params, *AREA, rng)
     assert len(hidden.boxes) == 0 or abs(np.arctan2(*hidden.boxes[0, 1::-1])) > 0.45
-    assert len(with_objects(street_with(), one_walker(14.0), params, *AREA, rng).boxes) == 1
+    assert len(paste_objects(street_with(), one_walker(14.0), params, *AREA, rng).boxes) == 1
 
 
-def test_posts_are_learned_from_but_are_no_objects():
+def test_posts_are_pasted_without_boxes():
     post = wall(8.0, (2.9, 3.1), (-1.73, 0.6))
     walker = one_walker(9.0)
     scene = street_with(post, walker.points, wall(11.0, (-8, -5), (-1.73, 0.5)))
     scene = replace(scene, boxes=walker.boxes, class_ids=walker.class_ids, wanted=np.ones(1, bool))
-    database = cut(scene, ("Pedestrian",), 5)
+    database = cut_objects(scene, ("Pedestrian",), 5)
     assert database.class_ids.tolist() == [PEDESTRIAN, THING]
-    assert len(cut(scene, ("Car",), 5)) == 0
+    assert len(cut_objects(scene, ("Car",), 5)) == 0
     box, own = database.boxes[1], database.points_of(1)
     assert (own[:, 0] == 8).all() and len(own) > 0.8 * len(post)
     assert box[:2] == pytest.approx([8, 3], abs=0.05) and box[5] == pytest.approx(2.33, abs=0.1)
     params = replace(STILL, things=1, things_stretch=0, things_intensity=0, things_shine=0)
-    fuller = with_objects(street_with(), database, params, *AREA, np.random.default_rng(0))
+    fuller = paste_objects(street_with(), database, params, *AREA, np.random.default_rng(0))
     assert len(fuller.boxes) == len(fuller.class_ids) == len(fuller.wanted) == 0
     added = fuller.points[-len(own):]
     np.testing.assert_allclose(np.hypot(added[:, 0], added[:, 1]),
@@ -258,19 +260,19 @@ def test_posts_are_learned_from_but_are_no_objects():
 
 
 @given(seeds)
-def test_noise_is_along_the_ray_and_beams_have_theirs_in_common(seed):
+def test_range_noise_is_along_rays_and_shared_by_beams(seed):
     rng = np.random.default_rng(seed)
     points = np.concatenate([random_scene(seed).points, np.zeros((1, 4), np.float32)])
-    assert np.array_equal(blurred(points, 0, 0, rng), points)
+    assert np.array_equal(blur_ranges(points, 0, 0, rng), points)
     before = np.linalg.norm(points[:-1, :3], axis=1)
     for beam, point in ((0.05, 0.0), (0.0, 0.05)):
-        moved = blurred(points, beam, point, rng)[:-1]
+        moved = blur_ranges(points, beam, point, rng)[:-1]
         after = np.linalg.norm(moved[:, :3], axis=1)
         np.testing.assert_allclose(moved[:, :3] / after[:, None],
                                    points[:-1, :3] / before[:, None], atol=1e-5)
         shift, (x, y, z) = after - before, points[:-1, :3].T
         assert 0.02 < shift.std() < 0.1
-        beams = np.floor(np.arctan2(z, np.hypot(x, y)) / STEP)
+        beams = np.floor(np.arctan2(z, np.hypot(x, y)) / BEAM_STEP)
         known, sizes = np.unique(beams, return_counts=True)
         fullest = shift[beams == known[sizes.argmax()]]
         assert (np.ptp(fullest) < 1e-3) == (point == 0)
@@ -280,12 +282,12 @@ STILL_THINGS = AugmentParams(things_stretch=0, things_intensity=0, things_shine=
 
 
 @given(seeds)
-def test_what_shines_of_a_thing_is_between_two_heights(seed):
+def test_reflector_spans_range_of_heights(seed):
     scene, rng = random_scene(seed), np.random.default_rng(seed)
     for box in scene.boxes:
-        own = scene.points[inside(scene.points, box, 0.0)]
+        own = scene.points[find_points_in_box(scene.points, box, 0.0)]
         own[:, 3] = 0.3
-        _, points = varied_thing(box, own, replace(STILL_THINGS, things_shine=1), rng)
+        _, points = vary_boxed_thing(box, own, replace(STILL_THINGS, things_shine=1), rng)
         bright = points[:, 3] > 0.9
         assert (points[~bright, 3] == np.float32(0.3)).all()
         if bright.any():
@@ -294,52 +296,53 @@ def test_what_shines_of_a_thing_is_between_two_heights(seed):
 
 
 @given(seeds)
-def test_things_are_stretched_upon_their_floor(seed):
+def test_stretched_things_keep_their_foot(seed):
     scene, rng = random_scene(seed), np.random.default_rng(seed)
     changes = replace(STILL_THINGS, things_stretch=0.5, things_intensity=0.4)
     for box in scene.boxes:
-        own = scene.points[inside(scene.points, box, 0.0)]
-        grown, points = varied_thing(box, own, changes, rng)
-        assert len(inside(points, grown, 1e-3)) == len(own)
-        assert grown[2] - grown[5] / 2 == pytest.approx(box[2] - box[5] / 2)
-        assert grown[[0, 1, 6]] == pytest.approx(box[[0, 1, 6]])
-        assert (np.abs(np.log(grown[3:6] / box[3:6])) <= 0.5).all()
-        same, still = varied_thing(box, own, STILL_THINGS, rng)
+        own = scene.points[find_points_in_box(scene.points, box, 0.0)]
+        stretched, points = vary_boxed_thing(box, own, changes, rng)
+        assert len(find_points_in_box(points, stretched, 1e-3)) == len(own)
+        assert stretched[2] - stretched[5] / 2 == pytest.approx(box[2] - box[5] / 2)
+        assert stretched[[0, 1, 6]] == pytest.approx(box[[0, 1, 6]])
+        assert (np.abs(np.log(stretched[3:6] / box[3:6])) <= 0.5).all()
+        same, still = vary_boxed_thing(box, own, STILL_THINGS, rng)
         np.testing.assert_allclose(same, box, atol=1e-12)
         np.testing.assert_allclose(still, own, atol=1e-6)
 
 
 @given(seeds, st.sampled_from([-1, 1]), st.sampled_from([-1, 1]))
-def test_nothing_that_may_come_into_view_is_cut_off(seed, larger, higher):
+def test_early_crop_keeps_everything_that_may_move_into_range(seed, larger, higher):
     scene, params = random_scene(seed), AugmentParams(turn=0, scale=0.1, height=0.3, tilt=0.1)
     low, high = np.array([0, -10, -1.8]), np.array([10.0, 10, 0.5])
 
     def changed(scene: TrainingScene) -> TrainingScene:
-        scene = raised(scaled(scene, 1 + larger * params.scale), higher * params.height,
-                       (higher * params.tilt, -larger * params.tilt))
-        return cropped(scene, low, high)
+        scene = raise_scene(scale_scene(scene, 1 + larger * params.scale),
+                            higher * params.height, (higher * params.tilt, -larger * params.tilt))
+        return crop_scene(scene, low, high)
 
-    part = faced(scene, params, low, high, np.random.default_rng(seed))
+    part = turn_and_crop(scene, params, low, high, np.random.default_rng(seed))
     assert len(part.points) < len(scene.points) and len(part.boxes) == len(part.class_ids)
-    whole, cut = changed(scene), changed(part)
-    assert np.array_equal(whole.points, cut.points)
-    np.testing.assert_allclose(whole.boxes, cut.boxes, atol=1e-12)
-    assert np.array_equal(whole.class_ids, cut.class_ids)
+    expected, cropped = changed(scene), changed(part)
+    assert np.array_equal(cropped.points, expected.points)
+    np.testing.assert_allclose(cropped.boxes, expected.boxes, atol=1e-12)
+    assert np.array_equal(cropped.class_ids, expected.class_ids)
 
 
-def test_scenes_that_are_labelled_all_around_are_turned_all_around():
+def test_scenes_labelled_all_around_turn_by_any_angle():
     def bearings(around: bool) -> np.ndarray:
         scene = TrainingScene(np.array([[5, 0, -1, 0.5]], np.float32), np.zeros((0, 7)),
                               np.zeros(0, int), np.zeros(0, bool), around)
-        turned = [faced(scene, AugmentParams(), np.full(3, -9.0), np.full(3, 9.0),
-                        np.random.default_rng(seed)).points[0] for seed in range(60)]
-        return np.abs(np.arctan2(*np.array(turned).T[1::-1]))
+        points = [turn_and_crop(scene, AugmentParams(), np.full(3, -9.0), np.full(3, 9.0),
+                                np.random.default_rng(seed)).points[0] for seed in range(60)]
+        return np.abs(np.arctan2(*np.array(points).T[1::-1]))
 
     assert bearings(True).max() > 2.5 and 0.6 < bearings(False).max() <= AugmentParams().turn
 
 
-def test_objects_survive_their_file_and_a_broken_file_is_named(tmp_path):
-    database = joined([cut(random_scene(k), ("Car", "Pedestrian"), 5) for k in range(4)])
+def test_database_file_round_trip_and_broken_file_is_named(tmp_path):
+    database = join_databases([cut_objects(random_scene(k), ("Car", "Pedestrian"), 5)
+                               for k in range(4)])
     assert len(database) > 0 and set(database.class_ids) <= {CAR, PEDESTRIAN}
     database.save(tmp_path / "objects.npz")
     back = Database.load(tmp_path / "objects.npz")
@@ -347,12 +350,12 @@ def test_objects_survive_their_file_and_a_broken_file_is_named(tmp_path):
     (tmp_path / "objects.npz").write_bytes(b"PK")
     with pytest.raises(InputError, match=r"objects\.npz"):
         Database.load(tmp_path / "objects.npz")
-    assert len(joined([])) == 0
+    assert len(join_databases([])) == 0
 
 
-def test_where_there_is_no_ground_nothing_is_put():
-    database = joined([cut(random_scene(k), ("Car",), 5) for k in range(4)])
+def test_nothing_is_pasted_without_ground():
+    database = join_databases([cut_objects(random_scene(k), ("Car",), 5) for k in range(4)])
     empty = TrainingScene(np.zeros((0, 4), np.float32), np.zeros((0, 7)), np.zeros(0, int),
                   np.zeros(0, bool))
-    assert len(with_objects(empty, database, AugmentParams(), *AREA,
+    assert len(paste_objects(empty, database, AugmentParams(), *AREA,
                             np.random.default_rng(0)).boxes) == 0

@@ -1,4 +1,4 @@
-"""train pointpillars from the command line."""
+"""train pointpillars on the command line."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from lidar_perception.detectors.pointpillars.detector import load_detector
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training.params import PAPER_SHARE, DataParams, PointPillarsTraining
-from lidar_perception.training.sources import training_scenes
+from lidar_perception.training.sources import open_sources
 from lidar_perception.types import InputError
 
-pytestmark = [pytest.mark.no_cover,  # others run these lines
+pytestmark = [pytest.mark.no_cover,  # covered by other tests
               pytest.mark.usefixtures("one_thread", "streets")]
 SENSOR = "generic:16,-20,5,2,10"
 
 
 @pytest.fixture
 def small(monkeypatch):
-    """The compact size with a few channels and a coarse grid."""
+    """Give the compact size few channels and a coarse grid."""
     monkeypatch.setitem(config_module.SIZES, "compact", dict(
         low=(0.0, -20.48, -3.0), high=(40.96, 20.48, 1.0), cell=0.64, pillar_channels=8,
         map_channels=(4, 8), block_channels=(8, 12, 16), block_layers=(1, 1, 1), deconv_channels=8,
@@ -41,7 +41,7 @@ def train(*arguments):
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
-    """Simulated scans are made once for all tests."""
+    """Folder of simulated scans that all tests share."""
     return tmp_path_factory.mktemp("cache")
 
 
@@ -52,7 +52,7 @@ def sim(cache, out, **changes):
     return [word for pair in given.items() for word in pair]
 
 
-def test_a_network_is_trained_on_simulated_scans_and_finds_its_way_into_the_detector(
+def test_trained_network_opens_as_detector(
         tmp_path, cache, small):
     out = tmp_path / "run"
     result = train(*sim(cache, out), "--version", "v4", "--seed", 5)
@@ -62,20 +62,20 @@ def test_a_network_is_trained_on_simulated_scans_and_finds_its_way_into_the_dete
     assert len(list(cache.glob("*.npz"))) == 2
     header = read_header(out / "last.safetensors")
     assert (header.config.version, header.config.size) == ("v4", "compact")
-    said = header.training
-    assert (said["steps"], said["seed"], said["batch"], said["scenes"]) == (4, 5, 2, 1)
-    assert said["data"] == ["sim"] and said["params"]["sensor"] == SENSOR
+    record = header.training
+    assert (record["steps"], record["seed"], record["batch"], record["scenes"]) == (4, 5, 2, 1)
+    assert record["data"] == ["sim"] and record["params"]["sensor"] == SENSOR
     assert "score" in header.metrics and header.commit
     json.loads(header.text())
     detector = load_detector(out / "best.safetensors", "cpu")
     detector(scan_at(3, 0, sensor_named(SENSOR)).frame)
-    # a finished run is left as it is, whatever is said twice
+    # a finished run does not change
     before = (out / "last.safetensors").read_bytes()
     again = train(*sim(cache, out), "--version", "v4", "--seed", 5)
     assert again.exit_code == 1 and "--resume" in str(again.exception)
     assert train(*sim(cache, out), "--version", "v4", "--seed", 5, "--resume").exit_code == 0
     assert (out / "last.safetensors").read_bytes() == before
-    # and its weights can be where another begins
+    # another run can start from its weights
     init = train(*sim(cache, tmp_path / "next", **{"--steps": 1}), "--version", "v4", "--init",
                  out / "last.safetensors")
     assert init.exit_code == 0, init.output
@@ -86,7 +86,7 @@ def test_a_network_is_trained_on_simulated_scans_and_finds_its_way_into_the_dete
     assert read_header(tmp_path / "other/last.safetensors").config.high == header.config.high
 
 
-def test_kitti_and_simulated_scenes_mix_and_broken_ones_are_counted(tmp_path, cache, small):
+def test_kitti_and_simulated_scenes_mix_and_broken_ones_count(tmp_path, cache, small):
     root = object_folder(tmp_path / "kitti", walker_label() + "\n", 6)
     write(root / "training/label_2/000002.txt", "Pedestrian 0 0 x\n")
     result = train(*sim(cache, tmp_path / "run"), "--data", root, "--version", "v0",
@@ -99,36 +99,36 @@ def test_kitti_and_simulated_scenes_mix_and_broken_ones_are_counted(tmp_path, ca
 
 
 def counts(*arguments) -> tuple[list, list]:
-    train_on, judge_on = training_scenes(*arguments)
+    train_on, judge_on = open_sources(*arguments)
     return [len(x) for x in train_on], [len(x) for x in judge_on]
 
 
-def test_what_is_held_out_is_not_trained_on(tmp_path):
+def test_held_out_frames_are_not_trained_on(tmp_path):
     root = object_folder(tmp_path, count=5)
     params = DataParams(scans=7, val_scans=2, val_share=0.4)
     folder = str(root)
-    (train_on, *_), (held, *_) = training_scenes((folder,), (), None, None, params, 0)
+    (train_on, *_), (held, *_) = open_sources((folder,), (), None, None, params, 0)
     assert (len(train_on), len(held)) == (3, 2) and not {*train_on.names} & {*held.names}
     assert counts((folder, "sim"), (), None, None, params, 0) == ([3, 7], [2, 2])
     assert counts((folder,), ("sim",), None, None, params, 0) == ([5], [2])
     assert counts(("sim",), (folder,), None, None, params, 0) == ([7], [5])
-    streets, = training_scenes(("sim",), (), None, None, params, 0)[0]
-    others, = training_scenes(("sim",), (), None, None, params, 0)[1]
+    streets, = open_sources(("sim",), (), None, None, params, 0)[0]
+    others, = open_sources(("sim",), (), None, None, params, 0)[1]
     assert streets.first + streets.count <= others.first
     ours, theirs = write(tmp_path / "a", "000000\n000001\n"), write(tmp_path / "b", "000001\n")
-    (train_on,), (held,) = training_scenes((folder,), (folder,), ours, theirs, params, 0)
+    (train_on,), (held,) = open_sources((folder,), (folder,), ours, theirs, params, 0)
     assert (train_on.names, held.names) == (("000000",), ("000001",))
-    (train_on,), (held,) = training_scenes((folder,), (), None, theirs, params, 0)
+    (train_on,), (held,) = open_sources((folder,), (), None, theirs, params, 0)
     assert len(train_on) == 4 and held.names == ("000001",)
     with pytest.raises(InputError, match="--split"):
-        training_scenes(("sim",), (), ours, None, params, 0)
+        open_sources(("sim",), (), ours, None, params, 0)
     with pytest.raises(InputError, match="--val-split"):
-        training_scenes(("sim",), (), None, theirs, params, 0)
+        open_sources(("sim",), (), None, theirs, params, 0)
     with pytest.raises(InputError, match="no frame is left"):
-        training_scenes((folder,), (folder,), theirs, theirs, params, 0)
+        open_sources((folder,), (folder,), theirs, theirs, params, 0)
 
 
-def test_a_frame_is_trained_on_or_validated_on_by_whatever_path_it_comes(tmp_path, monkeypatch):
+def test_training_and_validation_share_no_frame_by_any_path(tmp_path, monkeypatch):
     root = object_folder(tmp_path / "kitti", walker_label() + "\n", 5)
     write_bag(tmp_path / "bag", open_recording(root))
     file, = (tmp_path / "bag").glob("*.mcap")
@@ -137,9 +137,9 @@ def test_a_frame_is_trained_on_or_validated_on_by_whatever_path_it_comes(tmp_pat
     three = [f"{i:06}" for i in (2, 3, 4)]
 
     def names(*arguments) -> list[list[str]]:
-        """To train on, and to validate on."""
+        """Return the names of the frames to train on and to validate on."""
         return [sorted(name for source in sources for name in source.names)
-                for sources in training_scenes(*arguments, DataParams(val_share=0.4), 0)]
+                for sources in open_sources(*arguments, DataParams(val_share=0.4), 0)]
 
     for other in (str(root), "kitti", "kitti/training", "../" + tmp_path.name + "/kitti"):
         assert names((str(root),), (other,), some, None) == [["000000", "000001"], three]
@@ -159,7 +159,7 @@ def test_a_frame_is_trained_on_or_validated_on_by_whatever_path_it_comes(tmp_pat
     (["--data", "sim", "--lr", "0"], "lr = 0"),
     (["--data", "sim", "--init", "missing.safetensors"], "missing.safetensors"),
 ])
-def test_what_cannot_be_is_said_at_once(tmp_path, small, arguments, reason):
+def test_bad_input_is_refused_at_once(tmp_path, small, arguments, reason):
     result = train(*arguments, "--out", tmp_path / "run", "--jobs", 0, "--data-scans", 1,
                    "--augment-cars", 0, "--augment-pedestrians", 0, "--augment-cyclists", 0,
                    "--augment-things", 0)
@@ -167,18 +167,18 @@ def test_what_cannot_be_is_said_at_once(tmp_path, small, arguments, reason):
     assert not (tmp_path / "run" / "last.pt").exists()
 
 
-def test_the_papers_share_is_held_out_and_every_number_has_a_flag():
+def test_papers_share_is_held_out_and_every_field_has_flag():
     assert round(PAPER_SHARE * 7518) == 751
-    said = train("--help").output
+    text = train("--help").output
     for group in PointPillarsTraining, DataParams:
         for f in dataclasses.fields(group):
-            assert "--" in said and f.name.replace("_", "-") in said
+            assert "--" in text and f.name.replace("_", "-") in text
 
 
-def test_an_out_that_is_a_file_fails_before_any_data_is_made(tmp_path, monkeypatch):
+def test_out_that_is_file_fails_before_data_is_made(tmp_path, monkeypatch):
     def never(*_):
         raise AssertionError("data was prepared")
-    monkeypatch.setattr("lidar_perception.training.start.training_scenes", never)
+    monkeypatch.setattr("lidar_perception.training.planning.open_sources", never)
     file = write(tmp_path / "out", b"")
     for out in (file, file / "below"):
         for kind in ("pointpillars", "pointnet"):

@@ -1,4 +1,4 @@
-"""CUDA learns as the CPU does; where there is no GPU these tests are skipped."""
+"""Training on CUDA agrees with training on the CPU; skipped without a GPU."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from lidar_perception.classes import CAR
 from lidar_perception.detectors.pointpillars.network import channels_last, make_network
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.params import LoopParams
-from lidar_perception.training.pointpillars.task import Preparation, make_loss
+from lidar_perception.training.pointpillars.task import ScenePreparation, make_loss
 from lidar_perception.training.run import Run, Task
 from lidar_perception.types import PEDESTRIAN
 
 pytestmark = [pytest.mark.no_cover,
-              pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")]
+              pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")]
 
 
 def run_on(device: str, version: str, amp: str) -> tuple[Run, list]:
@@ -25,7 +25,7 @@ def run_on(device: str, version: str, amp: str) -> tuple[Run, list]:
     config = tiny(version)
     scene = TrainingScene(points=two_objects(), boxes=BOXES.numpy().astype(np.float64),
                           wanted=np.ones(2, bool), class_ids=np.array([CAR, PEDESTRIAN]))
-    batch = [Preparation(config, STILL)(scene, np.random.default_rng(0))] * 2
+    batch = [ScenePreparation(config, STILL)(scene, np.random.default_rng(0))] * 2
     place = torch.device(device)
     network = channels_last(make_network(config).to(place))
     params = LoopParams(steps=40, batch=2, lr=0.01, amp=amp)
@@ -34,14 +34,14 @@ def run_on(device: str, version: str, amp: str) -> tuple[Run, list]:
 
 
 @pytest.mark.parametrize("version", ["v0", "v3", "v4"])
-def test_a_step_of_training_is_that_of_the_cpu(version):
-    (here, batch), (there, _) = (run_on(device, version, "off") for device in ("cpu", "cuda"))
+def test_training_step_agrees_with_cpu(version):
+    (on_cpu, batch), (on_cuda, _) = (run_on(device, version, "off") for device in ("cpu", "cuda"))
     for _ in range(3):
-        ours, theirs = here.step(batch), there.step(batch)
+        ours, theirs = on_cuda.step(batch), on_cpu.step(batch)
         assert {name: pytest.approx(value, rel=0.02) for name, value in ours.items()} == theirs
 
 
-def test_it_learns_in_16_bits():
+def test_training_in_16_bits_lowers_loss():
     run, batch = run_on("cuda", "v4", "auto")
     assert run.format is torch.bfloat16
     losses = [run.step(batch)["loss"] for _ in range(run.steps)]

@@ -1,4 +1,4 @@
-"""Laws of what is learned from: sources, the stream, samples and their validation."""
+"""Data for training: simulated sources, the stream, samples and validation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 import torch
 from detection_samples import BOXES, tiny, two_objects
 from samples import WALKER
-from training_toy import STILL, broken_folder, keep_all
+from training_toy import STILL, broken_folder, prepare_all
 
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
@@ -28,19 +28,19 @@ from lidar_perception.simulation.camera import kitti_labels, turned_camera
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training import scenes as scenes_module
-from lidar_perception.training.augment import TrainingScene, raised
-from lidar_perception.training.cut_objects import cut
-from lidar_perception.training.data import Batches, Item, ReadScenes, Stream, loaded
-from lidar_perception.training.frames import labelled_frames
+from lidar_perception.training.augment import TrainingScene, raise_scene
+from lidar_perception.training.cut_objects import cut_objects
+from lidar_perception.training.data import Batches, Item, SceneReader, Stream, load_items
+from lidar_perception.training.frames import open_labelled_frames
 from lidar_perception.training.pointpillars.task import (
-    Preparation,
     Sample,
-    frame_to_validate,
+    ScenePreparation,
+    load_validation_frame,
     make_loss,
-    narrowed,
-    validation_report,
+    reduce_range,
+    validate_detector,
 )
-from lidar_perception.training.record import metrics_of
+from lidar_perception.training.record import select_metrics
 from lidar_perception.training.scenes import SimulatedScenes
 from lidar_perception.types import (
     CLASSES,
@@ -51,7 +51,7 @@ from lidar_perception.types import (
     InputError,
 )
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
 SENSOR = sensor_named("generic:8,-20,4,2,10")
@@ -59,7 +59,7 @@ SENSOR = sensor_named("generic:8,-20,4,2,10")
 
 # simulated scenes
 
-def test_simulated_scans_are_the_same_from_the_cache(tmp_path, monkeypatch):
+def test_cached_scans_equal_simulated_ones(tmp_path, monkeypatch):
     plain = SimulatedScenes(7, 2, SENSOR)
     cached = SimulatedScenes(7, 2, SENSOR, cache=tmp_path / "cache")
     frame, truth = plain.scan(1)
@@ -78,7 +78,7 @@ def test_simulated_scans_are_the_same_from_the_cache(tmp_path, monkeypatch):
     assert len(list((tmp_path / "cache").iterdir())) == 1
 
 
-def test_simulated_scenes_are_labelled_as_people_would():
+def test_hidden_simulated_objects_are_not_wanted():
     source = SimulatedScenes(7, 1, SENSOR)
     _, truth = source.scan(0)
     scene = source.scene(0)
@@ -91,7 +91,7 @@ def test_simulated_scenes_are_labelled_as_people_would():
 # the stream
 
 class Numbers:
-    """A source of scenes that are told apart by their only point."""
+    """Source of scenes that have one point, with the number of the scene."""
 
     def __init__(self, first: int, count: int):
         self.first, self.count = first, count
@@ -104,21 +104,21 @@ class Numbers:
         return TrainingScene(point, np.zeros((0, 7)), np.zeros(0, int), np.zeros(0, bool))
 
 
-def taken(batches: Batches, first: int, steps: int) -> list:
+def take_batches(batches: Batches, first: int, steps: int) -> list:
     stream = batches(first)
     result = [[(float(a), c) for a, _, c in next(stream)] for _ in range(steps)]
     stream.close()
     return result
 
 
-def test_the_stream_depends_on_the_seed_alone():
-    stream = Stream((Numbers(0, 7), Numbers(100, 4)), keep_all, 5)
-    whole = taken(Batches(stream, 3), 0, 12)
-    assert taken(Batches(stream, 3), 5, 7) == whole[5:]  # as after a stop
-    assert taken(Batches(stream, 3, jobs=2), 0, 6) == whole[:6]
-    pair = [taken(Batches(stream, 3, rank=rank, world=2), 0, 6) for rank in (0, 1)]
+def test_stream_depends_only_on_seed():
+    stream = Stream((Numbers(0, 7), Numbers(100, 4)), prepare_all, 5)
+    whole = take_batches(Batches(stream, 3), 0, 12)
+    assert take_batches(Batches(stream, 3), 5, 7) == whole[5:]  # as after a stop
+    assert take_batches(Batches(stream, 3, jobs=2), 0, 6) == whole[:6]
+    pair = [take_batches(Batches(stream, 3, rank=rank, world=2), 0, 6) for rank in (0, 1)]
     assert [batch for both in zip(*pair) for batch in both] == whole
-    assert taken(Batches(Stream(stream.sources, keep_all, 6), 3), 0, 12) != whole
+    assert take_batches(Batches(Stream(stream.sources, prepare_all, 6), 3), 0, 12) != whole
     flat = [point / 4 for batch in whole for point, _ in batch]
     assert sorted(flat[:11]) == sorted(flat[11:22]) == [*range(7), *range(100, 104)]
     assert flat[:11] != flat[11:22]
@@ -138,9 +138,9 @@ def labels_of(sample: Sample, anchors: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("version", ["v0", "v2", "v4"])
-def test_samples_hold_what_the_version_sees(version):
+def test_samples_have_inputs_of_version(version):
     config = tiny(version)
-    sample = Preparation(config, STILL)(scene_of_two(), np.random.default_rng(0))
+    sample = ScenePreparation(config, STILL)(scene_of_two(), np.random.default_rng(0))
     assert sample.points.shape[1] == config.point_columns
     assert (sample.cluster_map is not None) == config.pseudo_map
     assert sample.labels.tolist() == [0, 1] and sample.counted.all()
@@ -151,30 +151,30 @@ def test_samples_hold_what_the_version_sees(version):
     assert torch.isfinite(total) and set(parts) == {"classes", "boxes", "directions"}
 
 
-def test_a_share_of_the_scenes_gets_objects_of_others(tmp_path):
-    cut(scene_of_two(), tiny().classes, 1).save(tmp_path / "objects.npz")
-    rng, alone = np.random.default_rng(0), scene_of_two()
-    alone = replace(alone, boxes=alone.boxes[:1], class_ids=alone.class_ids[:1],
-                    wanted=alone.wanted[:1])
+def test_share_of_scenes_gets_pasted_objects(tmp_path):
+    cut_objects(scene_of_two(), tiny().classes, 1).save(tmp_path / "objects.npz")
+    rng, scene = np.random.default_rng(0), scene_of_two()
+    scene = replace(scene, boxes=scene.boxes[:1], class_ids=scene.class_ids[:1],
+                    wanted=scene.wanted[:1])
 
     def numbers(crowded: float) -> list[int]:
-        prepare = Preparation(tiny(), replace(STILL, pedestrians=1, crowded=crowded),
+        prepare = ScenePreparation(tiny(), replace(STILL, pedestrians=1, crowded=crowded),
                               database=tmp_path / "objects.npz")
-        return [len(prepare(alone, rng).labels) for _ in range(10)]
+        return [len(prepare(scene, rng).labels) for _ in range(10)]
 
-    none, some, all_of_them = map(numbers, (0.0, 0.5, 1.0))
-    assert set(none) == {1} and set(some) == {1, 2} and sum(all_of_them) > sum(none)
+    none, some, every = map(numbers, (0.0, 0.5, 1.0))
+    assert set(none) == {1} and set(some) == {1, 2} and sum(every) > sum(none)
 
 
-def test_what_nobody_needs_to_find_is_neither_object_nor_background():
+def test_anchors_on_uncounted_objects_are_ignored():
     config = tiny()
     anchors, kinds = make_anchors(config), anchor_classes(config)
     rng = np.random.default_rng(0)
-    whole = Preparation(config, STILL)(scene_of_two(), rng)
+    whole = ScenePreparation(config, STILL)(scene_of_two(), rng)
     found = labels_of(whole, anchors)
     for scene, prepare in (
-            (scene_of_two(wanted=np.array([False, True])), Preparation(config, STILL)),
-            (scene_of_two(class_ids=np.array([VAN, PEDESTRIAN])), Preparation(config, STILL))):
+            (scene_of_two(wanted=np.array([False, True])), ScenePreparation(config, STILL)),
+            (scene_of_two(class_ids=np.array([VAN, PEDESTRIAN])), ScenePreparation(config, STILL))):
         sample = prepare(scene, rng)
         assert sample.counted.tolist() == [False, True]
         labels = labels_of(sample, anchors)
@@ -182,49 +182,49 @@ def test_what_nobody_needs_to_find_is_neither_object_nor_background():
         near = (labels == IGNORED) & (kinds == 0)
         assert near.any() and (near | (labels == BACKGROUND) | (kinds != 0)).all()
         assert (found[near] != BACKGROUND).all()
-    few_points = Preparation(config, STILL, min_points=10**4)(scene_of_two(), rng)
+    few_points = ScenePreparation(config, STILL, min_points=10**4)(scene_of_two(), rng)
     assert not few_points.counted.any()
 
 
-def test_a_scene_that_the_network_cannot_see_is_skipped():
+def test_scene_without_points_in_range_is_refused():
     behind = scene_of_two(points=two_objects() * np.array([-1, 1, 1, 1], np.float32))
     with pytest.raises(InputError, match="no point"):
-        Preparation(tiny(), STILL)(behind, np.random.default_rng(0))
-    far = Preparation(tiny(), STILL)(scene_of_two(boxes=BOXES.numpy() + [90, 0, 0, 0, 0, 0, 0]),
-                                     np.random.default_rng(0))
+        ScenePreparation(tiny(), STILL)(behind, np.random.default_rng(0))
+    far = ScenePreparation(tiny(), STILL)(
+        scene_of_two(boxes=BOXES.numpy() + [90, 0, 0, 0, 0, 0, 0]), np.random.default_rng(0))
     assert len(far.boxes) == 0 and len(far.labels) == 0
     assert (labels_of(far, make_anchors(tiny())) == BACKGROUND).all()
 
 
-def test_a_perfect_detector_scores_and_a_blind_one_does_not(tmp_path):
+def test_validation_scores_perfect_and_blind_detectors(tmp_path):
     root = broken_folder(tmp_path)
-    scenes = ReadScenes((labelled_frames(root).scenes(),),
-                        partial(frame_to_validate, tiny()))
-    right = validation_report(lambda frame: Found(Detections.of([WALKER])), scenes)
-    blind = validation_report(lambda frame: Found(Detections.none()), scenes)
+    scenes = SceneReader((open_labelled_frames(root).to_scenes(),),
+                        partial(load_validation_frame, tiny()))
+    right = validate_detector(lambda frame: Found(Detections.of([WALKER])), scenes)
+    blind = validate_detector(lambda frame: Found(Detections.none()), scenes)
     assert right.compute()["frames"] == 3 and len(right.skipped) == 2
     names = ("Car", "Pedestrian", "Cyclist")
     for score in "bev", "map":
-        metrics = metrics_of(right.compute(), score, names)
+        metrics = select_metrics(right.compute(), score, names)
         assert metrics["score"] == metrics["Pedestrian_3d"] == 100.0
         assert np.isnan(metrics["Car_bev_relaxed"])
-        assert metrics_of(blind.compute(), score, names)["score"] == 0.0
-        assert np.isnan(metrics_of(right.compute(), score, ["Car"])["score"])  # no such object
+        assert select_metrics(blind.compute(), score, names)["score"] == 0.0
+        assert np.isnan(select_metrics(right.compute(), score, ["Car"])["score"])  # no such object
 
 
-@pytest.mark.parametrize("where", ["ahead", "around"])
-def test_without_a_camera_only_what_the_network_sees_is_to_be_found(where):
-    config = network_config("v0", "compact", **(RANGES["around"] if where == "around" else {}))
+@pytest.mark.parametrize("view", ["ahead", "around"])
+def test_validation_without_camera_keeps_labels_in_range(view):
+    config = network_config("v0", "compact", **(RANGES["around"] if view == "around" else {}))
     source = SimulatedScenes(7, 1, SENSOR, Scenes(None, 3.0, "campus"))
     known = source.frame(0).truth()
-    truth = frame_to_validate(config, source, 0).truth()
+    truth = load_validation_frame(config, source, 0).truth()
     seen = within(known.boxes, config.low, config.high)
     assert np.array_equal(truth.boxes, known.boxes[seen]) and len(truth.extras) == len(truth)
-    assert 0 < len(truth) and (len(truth) < len(known) or where == "around")
+    assert 0 < len(truth) and (len(truth) < len(known) or view == "around")
 
 
-def test_samples_are_plain_arrays_that_other_processes_can_send():
-    sample = Preparation(tiny("v4"), STILL)(scene_of_two(), np.random.default_rng(0))
+def test_samples_consist_of_arrays():
+    sample = ScenePreparation(tiny("v4"), STILL)(scene_of_two(), np.random.default_rng(0))
     values = {**vars(sample), **sample.targets._asdict()}
     assert values.pop("targets") is sample.targets
     assert all(isinstance(value, np.ndarray) for value in values.values())
@@ -232,16 +232,16 @@ def test_samples_are_plain_arrays_that_other_processes_can_send():
 
 
 class Workers:
-    """items[n]: the process that makes them."""
+    """Items whose value is the id of the process that makes them."""
 
     def __getitem__(self, n: int) -> int:
         return os.getpid()
 
 
-def test_workers_end_with_a_process_that_is_killed():
+def test_workers_end_when_main_process_is_killed():
     script = ("from test_training_data import Workers\n"
-              "from lidar_perception.training.data import loaded\n"
-              "for pids in loaded(Workers(), ([n] for n in range(10**6)), 1):\n"
+              "from lidar_perception.training.data import load_items\n"
+              "for pids in load_items(Workers(), ([n] for n in range(10**6)), 1):\n"
               "    print(pids[0], flush=True)\n"
               "    input()\n")
     with subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parent, text=True,
@@ -259,15 +259,15 @@ def test_workers_end_with_a_process_that_is_killed():
 
 
 class Large:
-    """items[n]: the process that makes them, and more than a pipe holds."""
+    """Items with the id of the process that makes them, larger than the buffer of a pipe."""
 
     def __getitem__(self, n: int) -> tuple[int, bytes]:
         return os.getpid(), bytes(10**7)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_a_worker_that_is_killed_in_the_middle_of_a_batch_ends_the_training_with_a_reason(jobs):
-    batches = loaded(Large(), ([n] for n in range(10**6)), jobs)
+def test_killed_worker_ends_training_with_reason(jobs):
+    batches = load_items(Large(), ([n] for n in range(10**6)), jobs)
     pid = next(batches)[0][0]
     time.sleep(0.2)  # it is sending the next one
     os.kill(pid, signal.SIGKILL)
@@ -276,16 +276,15 @@ def test_a_worker_that_is_killed_in_the_middle_of_a_batch_ends_the_training_with
             next(batches)
 
 
-# the sensor's height, and what is around
+# sensor height and range
 
-def test_a_sensor_mounted_elsewhere_gives_the_network_the_same():
-    """A scene, and the same as a higher or lower sensor would have it."""
+def test_samples_do_not_depend_on_sensor_height():
     scene = scene_of_two()
     for config in tiny(), tiny("v4"):
-        usual = Preparation(config, STILL)(scene, np.random.default_rng(0))
+        usual = ScenePreparation(config, STILL)(scene, np.random.default_rng(0))
         for height in 0.6, 2.4:
-            other = replace(raised(scene, SENSOR_HEIGHT - height), height=height)
-            made = Preparation(config, STILL)(other, np.random.default_rng(0))
+            other = replace(raise_scene(scene, SENSOR_HEIGHT - height), height=height)
+            made = ScenePreparation(config, STILL)(other, np.random.default_rng(0))
             assert np.allclose(made.points, usual.points, atol=1e-5)
             assert np.allclose(made.boxes, usual.boxes, atol=1e-5)
             assert np.array_equal(made.labels, usual.labels)
@@ -293,7 +292,7 @@ def test_a_sensor_mounted_elsewhere_gives_the_network_the_same():
 
 
 @pytest.mark.parametrize("quarter", range(4))
-def test_labels_in_a_turned_camera_are_those_of_the_turned_scene(quarter):
+def test_labels_in_turned_camera_equal_those_of_turned_scene(quarter):
     _, truth = SimulatedScenes(7, 1, SENSOR).scan(0)
     yaw = quarter * np.pi / 2
     cos, sin = np.cos(-yaw), np.sin(-yaw)
@@ -308,9 +307,9 @@ def test_labels_in_a_turned_camera_are_those_of_the_turned_scene(quarter):
     assert np.allclose(frame.calibration().lidar_to_camera, turned_camera(yaw).lidar_to_camera)
 
 
-def test_a_part_of_a_range_around_keeps_all_directions():
+def test_reduced_range_around_keeps_all_directions():
     around = network_config("v0", "compact", **RANGES["around"])
-    part = narrowed(around, 30.0, 20.0)
+    part = reduce_range(around, 30.0, 20.0)
     assert part.low[:2] == pytest.approx((-30.72, -20.48)) and part.high[:2] == pytest.approx(
         (30.72, 20.48))
-    assert narrowed(around, 1000.0, 1000.0) == around
+    assert reduce_range(around, 1000.0, 1000.0) == around

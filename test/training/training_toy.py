@@ -1,5 +1,5 @@
-"""What tests of training share: one that is small enough to be compared bit by bit, what it wrote,
-scenes that nothing changes, and a folder some of whose frames are broken."""
+"""Builders for tests of training: a toy network, readers of the files of a run, parameters without
+augmentation, and a folder with broken frames."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import torch
 from samples import object_folder, walker_label, write
 from torch import nn
 
-from lidar_perception.training.out import STATE
+from lidar_perception.training.distributed import get_rank, get_world_size
 from lidar_perception.training.params import AugmentParams, LoopParams
-from lidar_perception.training.ranks import rank, world
 from lidar_perception.training.run import Task
+from lidar_perception.training.run_directory import STATE
 
 PARAMS = LoopParams(steps=13, validate_steps=4, save_steps=3, log_steps=1, seed=3, lr=0.05,
                     amp="off")
 
 
 class Toy:
-    """A regression with dropout and batch norm. before(step) runs in the loss of each step."""
+    """Regression with dropout and batch norm. The loss of each step calls before(step)."""
 
     def __init__(self, before=lambda step: None, plain: bool = False, size: int = 8):
         torch.manual_seed(5)
         middle = [] if plain else [nn.BatchNorm1d(6), nn.Dropout(0.3)]
         self.module = nn.Sequential(nn.Linear(4, 6), *middle, nn.ReLU(), nn.Linear(6, 1))
-        self.before, self.size, self.kept = before, size, {}
+        self.before, self.size, self.saved = before, size, {}
 
     def task(self, **about) -> Task:
-        return Task(self.module, self.loss, self.batches, self.validate, self.keep, 4, about)
+        return Task(self.module, self.loss, self.batches, self.validate, self.save, 4, about)
 
     def loss(self, module, batch):
         step, inputs, wanted = batch
@@ -40,8 +40,8 @@ class Toy:
     def batches(self, step):
         while True:
             rng = torch.Generator().manual_seed(step)
-            inputs = torch.randn(self.size * world(), 4, generator=rng)
-            inputs = inputs[rank() * self.size:(rank() + 1) * self.size]
+            inputs = torch.randn(self.size * get_world_size(), 4, generator=rng)
+            inputs = inputs[get_rank() * self.size:(get_rank() + 1) * self.size]
             yield step, inputs, inputs[:, :1] * 2 - inputs[:, 1:2]
             step += 1
 
@@ -52,9 +52,9 @@ class Toy:
             error = (module(inputs) - inputs[:, :1] * 2 + inputs[:, 1:2]).square().mean()
         return {"score": -error.item()}, {}
 
-    def keep(self, name, module, record):
+    def save(self, name, module, record):
         state = {k: v.clone() for k, v in module.state_dict().items()}
-        self.kept[name] = state, record
+        self.saved[name] = state, record
 
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:
@@ -73,7 +73,7 @@ def rows(folder: Path, name: str = "log.csv") -> list[dict]:
 
 
 def equals(folder: Path, other: Path) -> bool:
-    """Whether two runs wrote the same, but for times."""
+    """Return True if two runs wrote the same files, apart from durations."""
     return (same(weights(folder), weights(other)) and rows(folder) == rows(other)
             and rows(folder, "validation.csv") == rows(other, "validation.csv"))
 
@@ -84,7 +84,7 @@ STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0
 
 
 def broken_folder(root):
-    """Five frames, of which 1 has a broken label and 3 a scan that was cut."""
+    """Write five frames, of which 1 has a broken label file and 3 a truncated scan."""
     object_folder(root, walker_label() + "\n", 5)
     write(root / "training/label_2/000001.txt", "Pedestrian 0 0 x\n")
     scan = root / "training/velodyne/000003.bin"
@@ -92,6 +92,6 @@ def broken_folder(root):
     return root
 
 
-def keep_all(scene, rng):
-    """Stands for a network's preparation: what it is given, and a number of the rng."""
+def prepare_all(scene, rng):
+    """Stand in for the preparation of a network; returns its input and a random number."""
     return scene.points.sum(), scene.boxes, rng.random()

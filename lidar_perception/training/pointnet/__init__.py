@@ -1,1 +1,1 @@
-"""What the cluster network is trained with."""
+"""Training of the PointNet on clusters."""

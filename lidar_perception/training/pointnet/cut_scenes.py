@@ -1,6 +1,7 @@
-"""Scenes to labelled clusters, cut by the package's own ground and clustering, with a cache.
+"""Labelled clusters, cut from scenes by the package's own ground and clustering, with a cache.
 
-So a network sees the errors that it will see later: objects in pieces, objects merged, background.
+Training thus shows the network the errors that it meets later: split and merged objects, and
+background.
 """
 
 from __future__ import annotations
@@ -23,23 +24,29 @@ from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.scoring.points.clusters import UNKNOWN, labelled
 from lidar_perception.scoring.thinning import drawn
-from lidar_perception.training.augment import TrainingScene, raised
-from lidar_perception.training.cache import kept, path_in, state_of
+from lidar_perception.training.augment import TrainingScene, raise_scene
+from lidar_perception.training.cache import cache_path, file_fingerprint, load_or_make
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, LidarFrame
 
-SPARSE = 0.08, 0.7  # of the points stay where a scene is thinned,
-FEWEST = 3          # and a cluster counts there that has so many left
-AROUND = 0.3  # m: points so near to an object are looked at, too
-DECOYS = 24    # in a scene, at most
-PROPOSED = 14  # proposals of each class among them, where there is a proposer,
-MADE_UP = 8    # and others beside those
+SPARSE_SHARES = 0.08, 0.7  # smallest and largest share of the points left in a sparse scene
+MIN_POINTS_LEFT = 3        # of a cluster in a sparse or augmented scene
+OBJECT_MARGIN_M = 0.3      # points this near to an object are cut out with it
+MAX_DECOYS = 24            # random decoys in a scene without a proposer
+MAX_PROPOSALS = 14         # of each class in a scene with a proposer,
+MAX_RANDOM_DECOYS = 8      # and random decoys there
 
 
 @dataclass(frozen=True)
 class CutScene:
-    """K clusters with labels (K,) int64 of scoring.points.clusters.labelled; boxes (K, 7) float64
-    of the objects, 0 where there is none. loose (K,) bool: not made by clustering but all around an
-    object, or decoy, that is not ground."""
+    """K clusters of a scene.
+
+    Attributes:
+        clusters: The clusters.
+        labels: (K,) int64, as scoring.points.clusters.labelled gives them.
+        boxes: (K, 7) float64 boxes of the objects, 0 for background.
+        loose: (K,) bool, True for clusters that are not made by clustering but consist of all
+            obstacle points around an object or decoy.
+    """
 
     clusters: Clusters
     labels: np.ndarray
@@ -49,10 +56,17 @@ class CutScene:
 
 @dataclass(frozen=True)
 class CutScenes:
-    """scene(i): the clusters of a scene of `scenes`, as a network of the config is to see them, of
-    min_points or more. cache: folder for them, or None. proposer: a file of PointPillars' weights
-    whose proposals are among the decoys, or None. sparse: so many of the scenes, 0..1, are thinned
-    as a whole before they are cut, as a sparser sensor would see them; always the same ones."""
+    """A source whose scene(i) is the CutScene of scene i, see cut_clusters.
+
+    Attributes:
+        scenes: Source of scenes.
+        config: Configuration of the network.
+        min_points: Clusters with fewer points are left out.
+        cache: Folder that keeps the clusters, or None.
+        proposer: PointPillars checkpoint whose wrong proposals become decoys, or None.
+        sparse: Share of the scenes that lose points before they are cut, as from a sparser
+            sensor; always the same ones.
+    """
 
     scenes: Any
     config: PointNetConfig
@@ -65,118 +79,139 @@ class CutScenes:
         return len(self.scenes)
 
     def frame(self, i: int) -> Frame:
-        """The frame that it is cut from, to validate on."""
+        """Return the frame of scene i, to validate on."""
         return self.scenes.frame(i)
 
-    def share(self, i: int) -> float:
-        """Of the points of scene i that stay."""
+    def draw_share(self, i: int) -> float:
+        """Return the share of its points that scene i keeps."""
         rng = np.random.default_rng(i)
         if rng.random() >= self.sparse:
             return 1.0
-        return float(np.exp(rng.uniform(*np.log(SPARSE))))
+        return float(np.exp(rng.uniform(*np.log(SPARSE_SHARES))))
 
     def path(self, i: int) -> Path | None:
-        """The file that keeps the clusters of scene i."""
-        proposer = [] if self.proposer is None else [state_of(self.proposer)]
-        thinned = [share] if (share := self.share(i)) < 1 else []
-        return path_in(self.cache, self.scenes.key(i), self.config.ground, self.config.clustering,
-                       self.config.classes, self.min_points, *proposer, *thinned)
+        """Return the cache file of scene i."""
+        proposer = [] if self.proposer is None else [file_fingerprint(self.proposer)]
+        sparse = [share] if (share := self.draw_share(i)) < 1 else []
+        return cache_path(self.cache, self.scenes.key(i), self.config.ground,
+                          self.config.clustering, self.config.classes, self.min_points, *proposer,
+                          *sparse)
 
     def keep(self, i: int) -> None:
-        """Put it into the cache."""
+        """Put the clusters of scene i into the cache."""
         self.scene(i)
 
     def scene(self, i: int) -> CutScene:
-        """InputError naming the file that cannot be used."""
-        return kept(self.path(i), lambda: self._cut(i), _read, _arrays)
+        """Return the clusters of scene i. Raise InputError, naming the file, for a broken scene."""
+        return load_or_make(self.path(i), lambda: self._cut(i), _from_arrays, _to_arrays)
 
     def _cut(self, i: int) -> CutScene:
-        scene, least, share = self.scenes.scene(i), self.min_points, self.share(i)
+        scene, min_points, share = self.scenes.scene(i), self.min_points, self.draw_share(i)
         if share < 1:
             left = drawn(len(scene.points), share, str(i))
-            scene, least = replace(scene, points=scene.points[left]), min(least, FEWEST)
-        return cut(scene, self.config, least, self.proposer)
+            scene = replace(scene, points=scene.points[left])
+            min_points = min(min_points, MIN_POINTS_LEFT)
+        return cut_clusters(scene, self.config, min_points, self.proposer)
 
 
-def cut(scene: TrainingScene, config: PointNetConfig, min_points: int,
-        proposer: Path | None = None) -> CutScene:
-    """The clusters of a scene, as from SENSOR_HEIGHT; after them the points around each object that
-    is wanted, and decoys: background cut out in the same way, as the network judges what is in a
-    detector's boxes, too; some of them where a proposer is wrong. A cluster of an object that is
-    not wanted is UNKNOWN."""
-    sensed = scene.points[:, :3]  # whose density counts, as where the network is used
-    scene = raised(scene, scene.height - SENSOR_HEIGHT)
+def cut_clusters(scene: TrainingScene, config: PointNetConfig, min_points: int,
+                 proposer: Path | None = None) -> CutScene:
+    """Cut a scene into labelled clusters, as from a sensor at SENSOR_HEIGHT.
+
+    After the clusters come the loose ones: the points around each wanted object, and decoys, which
+    are background cut out in the same way. The network needs both, since it also classifies the
+    points in a detector's boxes. Clusters of objects that are not wanted are UNKNOWN.
+
+    Args:
+        scene: The scene.
+        config: Configuration of the network.
+        min_points: Clusters with fewer points are left out.
+        proposer: PointPillars checkpoint, some of whose wrong proposals become decoys.
+    """
+    sensed = scene.points[:, :3]  # clustering uses the density that the sensor sees
+    scene = raise_scene(scene, scene.height - SENSOR_HEIGHT)
     frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
     ground = segment_ground(frame, config.ground)
     clusters = clusters_of(frame, cluster_obstacles(frame.xyz, ground, config.clustering, sensed),
                            min_points, ground)
     labels, owners = labelled(clusters, scene.boxes, scene.class_ids, config.classes)
-    hidden = (owners >= 0) & ~np.append(scene.wanted, False)[owners]
-    labels[hidden], owners[hidden] = UNKNOWN, -1
+    unwanted = (owners >= 0) & ~np.append(scene.wanted, False)[owners]
+    labels[unwanted], owners[unwanted] = UNKNOWN, -1
     boxes = np.zeros((len(clusters), 7))
     boxes[owners >= 0] = scene.boxes[owners[owners >= 0]]
     background = len(config.classes)
     wanted = [i for i in np.flatnonzero(scene.wanted)
               if CLASSES[scene.class_ids[i]] in config.classes]
-    made_up = elsewhere(decoys(clusters.take(np.flatnonzero(labels == background)), config),
-                        scene.boxes)
+    decoys = drop_touching(make_decoys(clusters.take(np.flatnonzero(labels == background)), config),
+                           scene.boxes)
     proposed = np.zeros((0, 7))
     if proposer is not None:
-        made_up, proposed = made_up[:MADE_UP], elsewhere(proposals(frame, proposer), scene.boxes)
-    around = np.concatenate([scene.boxes[wanted].reshape(-1, 7), proposed, made_up])
-    of_around = np.append([config.classes.index(CLASSES[scene.class_ids[i]]) for i in wanted],
-                          np.full(len(around) - len(wanted), background)).astype(np.int64)
+        decoys = decoys[:MAX_RANDOM_DECOYS]
+        proposed = drop_touching(propose_boxes(frame, proposer), scene.boxes)
+    cut_boxes = np.concatenate([scene.boxes[wanted].reshape(-1, 7), proposed, decoys])
+    cut_labels = np.append([config.classes.index(CLASSES[scene.class_ids[i]]) for i in wanted],
+                           np.full(len(cut_boxes) - len(wanted), background)).astype(np.int64)
     obstacles = frame.take(np.flatnonzero(~ground))
-    loose = points_of(around, obstacles, AROUND)
+    loose = points_of(cut_boxes, obstacles, OBJECT_MARGIN_M)
     kept = np.flatnonzero(loose.sizes >= min_points)
     loose = loose.take(kept).on(frame.xyz.compress(ground, axis=0))
     both = Clusters(np.concatenate([clusters.points, loose.points]),
                     np.concatenate([clusters.first, clusters.first[-1] + loose.first[1:]]),
                     np.concatenate([clusters.ids, np.full(len(loose), -1)]),
                     np.concatenate([clusters.ground, loose.ground]))
-    return CutScene(both, np.concatenate([labels, of_around[kept]]),
-                    np.concatenate([boxes, around[kept]]), np.arange(len(both)) >= len(clusters))
+    return CutScene(both, np.concatenate([labels, cut_labels[kept]]),
+                    np.concatenate([boxes, cut_boxes[kept]]),
+                    np.arange(len(both)) >= len(clusters))
 
 
-def decoys(background: Clusters, config: PointNetConfig) -> np.ndarray:
-    """(D, 7) boxes as large as objects, at most DECOYS, each at the mean of a background cluster
-    and on the ground there. The same clusters give the same."""
+def make_decoys(background: Clusters, config: PointNetConfig) -> np.ndarray:
+    """Return boxes (D, 7) of object size on background clusters, the same for the same clusters.
+
+    At most MAX_DECOYS, each near the mean of a cluster and on the ground there.
+    """
     rng = np.random.default_rng(len(background.points))
-    chosen = rng.permutation(len(background))[:DECOYS]
+    chosen = rng.permutation(len(background))[:MAX_DECOYS]
     own = background.take(chosen)
-    places = middles(own.points, own.first)
+    centres = middles(own.points, own.first)
     sizes = np.array(config.sizes)[rng.integers(len(config.sizes), size=len(own))]
     sizes = sizes * rng.uniform(0.9, 1.15, sizes.shape)
-    return np.column_stack([places + rng.normal(0, 0.2, places.shape),
+    return np.column_stack([centres + rng.normal(0, 0.2, centres.shape),
                             own.floor + sizes[:, 2] / 2, sizes,
                             rng.uniform(-np.pi, np.pi, len(own))])
 
 
-def proposals(frame: LidarFrame, proposer: Path) -> np.ndarray:
-    """(P, 7) boxes that PointPillars with these weights proposes at SENSOR_HEIGHT, as low as its
-    score is: the best of each class, at most PROPOSED."""
-    found = _proposer(proposer).propose(frame).detections
-    return np.concatenate([found.boxes[found.class_ids == i][:PROPOSED]
+def propose_boxes(frame: LidarFrame, proposer: Path) -> np.ndarray:
+    """Return the boxes (P, 7) that PointPillars proposes at any score.
+
+    Args:
+        frame: Cloud of a sensor at SENSOR_HEIGHT.
+        proposer: Checkpoint of PointPillars.
+
+    Returns:
+        The best MAX_PROPOSALS boxes of each class.
+    """
+    found = _load_proposer(proposer).propose(frame).detections
+    return np.concatenate([found.boxes[found.class_ids == i][:MAX_PROPOSALS]
                            for i in range(len(CLASSES))])
 
 
 @lru_cache(maxsize=1)
-def _proposer(path: Path) -> PointPillarsDetector:
-    """One for each process, with the least score of fused."""
+def _load_proposer(path: Path) -> PointPillarsDetector:
+    """Load a proposer with the lowest score that `fused` uses, once in each process."""
     params = DetectorParams(pointpillars=PointPillarsParams(warm_up=False))
     return load_detector(path, "cpu", params).raw().with_min_score(FusedParams().proposals)
 
 
-def elsewhere(found: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Those of boxes (D, 7) that touch none of the labelled ones (M, 7)."""
-    room = boxes + [0, 0, 0, 2 * AROUND, 2 * AROUND, 0, 0]
-    return found[~(bev_iou(found, room) > 0).any(axis=1)]
+def drop_touching(found: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Return those of boxes (D, 7) that touch none of the labelled boxes (M, 7)."""
+    enlarged = boxes + [0, 0, 0, 2 * OBJECT_MARGIN_M, 2 * OBJECT_MARGIN_M, 0, 0]
+    return found[~(bev_iou(found, enlarged) > 0).any(axis=1)]
 
 
-def _arrays(scene: CutScene) -> dict[str, np.ndarray]:
+def _to_arrays(scene: CutScene) -> dict[str, np.ndarray]:
     return dict(**vars(scene.clusters), labels=scene.labels, boxes=scene.boxes, loose=scene.loose)
 
 
-def _read(arrays: Any) -> CutScene:
+def _from_arrays(arrays: Any) -> CutScene:
     clusters = Clusters(*(arrays[name] for name in ("points", "first", "ids", "ground")))
     return CutScene(clusters, arrays["labels"], arrays["boxes"], arrays["loose"])

@@ -1,4 +1,4 @@
-"""What the cluster network brings to the training loop: samples, loss, validation, checkpoints."""
+"""The training task of the PointNet: samples, loss and validation."""
 
 from __future__ import annotations
 
@@ -31,20 +31,32 @@ from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import track
 from lidar_perception.scoring.detections import Detected
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.training.augment import noisy, varied
-from lidar_perception.training.data import Batches, ReadScenes, loaded
+from lidar_perception.training.augment import add_range_noise, vary_thing
+from lidar_perception.training.data import Batches, SceneReader, load_items
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
-from lidar_perception.training.pointnet.cut_scenes import FEWEST, CutScene, CutScenes
-from lidar_perception.training.record import begun_with, judged, keeper, name_skipped
-from lidar_perception.training.run import Judged, Task
+from lidar_perception.training.pointnet.cut_scenes import MIN_POINTS_LEFT, CutScene, CutScenes
+from lidar_perception.training.record import (
+    load_initial_weights,
+    make_save,
+    report_skipped,
+    summarize_report,
+)
+from lidar_perception.training.run import Task, Validation
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError
 
-SCORED_POINTS = 10  # clusters with fewer do not count in the accuracy
+MIN_SCORED_POINTS = 10  # of a cluster that counts in the accuracy
 
 
 @dataclass(frozen=True)
 class ClusterSample:
-    """Clusters for the network with what it shall say: labels (K,) int64, has_box (K,) bool."""
+    """K clusters with their targets.
+
+    Attributes:
+        inputs: Input of the network.
+        labels: (K,) int64 classes.
+        targets: Encoded boxes.
+        has_box: (K,) bool, the box target counts.
+    """
 
     inputs: ClusterInput
     labels: np.ndarray
@@ -54,16 +66,21 @@ class ClusterSample:
 
 @dataclass(frozen=True)
 class ClusterPreparation:
-    """scene, rng -> ClusterSample: some of its clusters, changed in ways that a network should not
-    mind."""
+    """Makes a ClusterSample of a scene: draws some of its clusters and augments them.
+
+    Attributes:
+        config: Configuration of the network.
+        augment: Numbers of clusters, and limits of the changes.
+        with_decoys: Half of the background consists of decoys, if there are enough.
+    """
 
     config: PointNetConfig
     augment: ClusterAugmentParams
-    judge: bool = False  # half of the background is decoys, as far as there are any
+    with_decoys: bool = False
 
     def __call__(self, scene: CutScene, rng: np.random.Generator) -> ClusterSample:
-        """InputError if it has no cluster to learn from."""
-        chosen = self._chosen(scene, rng)
+        """Prepare a scene. Raise InputError if it has no cluster to learn from."""
+        chosen = self._draw_clusters(scene, rng)
         if len(chosen) == 0:
             raise InputError("a scene has no cluster to learn from")
         labels, boxes = scene.labels[chosen], scene.boxes[chosen].copy()
@@ -72,53 +89,66 @@ class ClusterPreparation:
         feet = np.column_stack([middles(clusters.points, clusters.first), clusters.floor])
         for k in background:
             own = slice(clusters.first[k], clusters.first[k + 1])
-            clusters.points[own], _ = varied(clusters.points[own], feet[k], self.augment, rng)
-        clusters, boxes = changed(clusters, boxes, scene.loose[chosen], self.augment, rng)
+            clusters.points[own], _ = vary_thing(clusters.points[own], feet[k], self.augment,
+                                                 rng)
+        clusters, boxes = augment_clusters(clusters, boxes, scene.loose[chosen], self.augment, rng)
         inputs = network_input(clusters, self.config.points, int(rng.integers(1 << 30)))
         has_box = (labels >= 0) & (labels < len(self.config.classes))
         classes = np.where(has_box, labels, 0)
         targets = encode(boxes, classes, inputs.centres, inputs.azimuths, self.config)
         return ClusterSample(inputs, labels, targets, has_box)
 
-    def _chosen(self, scene: CutScene, rng: np.random.Generator) -> np.ndarray:
-        """All objects, up to a number of each class, and some background."""
+    def _draw_clusters(self, scene: CutScene, rng: np.random.Generator) -> np.ndarray:
+        """Draw objects up to a number of each class, and some background."""
         chosen = []
         for label in range(len(self.config.classes) + 1):
-            most = (self.augment.background if label == len(self.config.classes)
-                    else self.augment.objects)
-            known = rng.permutation(np.flatnonzero(scene.labels == label))
-            if self.judge and label == len(self.config.classes):
-                decoys = known[scene.loose[known]][:most // 2]
-                known = np.concatenate([decoys, known[~scene.loose[known]]])
-            chosen.append(known[:most])
+            limit = (self.augment.background if label == len(self.config.classes)
+                     else self.augment.objects)
+            own = rng.permutation(np.flatnonzero(scene.labels == label))
+            if self.with_decoys and label == len(self.config.classes):
+                decoys = own[scene.loose[own]][:limit // 2]
+                own = np.concatenate([decoys, own[~scene.loose[own]]])
+            chosen.append(own[:limit])
         return np.sort(np.concatenate(chosen))
 
 
-def changed(clusters: Clusters, boxes: np.ndarray, loose: np.ndarray,
-            params: ClusterAugmentParams, rng: np.random.Generator
-            ) -> tuple[Clusters, np.ndarray]:
-    """Clusters and their boxes (K, 7), all flipped and scaled in the same way, each moved
-    away with fewer points as a sensor would see it, thinned and made noisy by itself; loose ones
-    (K,) cut at a box that is a little off."""
+def augment_clusters(clusters: Clusters, boxes: np.ndarray, loose: np.ndarray,
+                     params: ClusterAugmentParams, rng: np.random.Generator
+                     ) -> tuple[Clusters, np.ndarray]:
+    """Change clusters at random.
+
+    All are flipped and scaled in the same way. Each loses points, gets noise, and may be moved away
+    with as many points as the sensor would see there. Loose clusters are cut at a shifted box.
+
+    Args:
+        clusters: K clusters.
+        boxes: (K, 7) boxes.
+        loose: (K,) bool, see CutScene.
+        params: Limits of the changes.
+        rng: Random generator.
+
+    Returns:
+        The changed clusters and boxes.
+    """
     count = len(clusters)
     number = np.repeat(np.arange(count), clusters.sizes)
     points, boxes = clusters.points.copy(), boxes.copy()
     keep = np.ones(len(points), bool)
     for k in np.flatnonzero(loose):
         part = slice(clusters.first[k], clusters.first[k + 1])
-        off = boxes[k] + rng.normal(0, params.box_shift, 7) * [1, 1, 0.5, 0, 0, 0, 0.3]
-        off[3:6] *= rng.uniform(0.9, 1.15, 3)
-        keep[part] = points_in_box(points[part, :3], off)
+        shifted = boxes[k] + rng.normal(0, params.box_shift, 7) * [1, 1, 0.5, 0, 0, 0, 0.3]
+        shifted[3:6] *= rng.uniform(0.9, 1.15, 3)
+        keep[part] = points_in_box(points[part, :3], shifted)
     farther = np.where(rng.random(count) < 0.3, rng.uniform(1, 1 + params.farther, count), 1.0)
     share = np.where(rng.random(count) < 0.5, rng.uniform(1 - params.dropout, 1, count), 1.0)
     keep &= rng.random(len(points)) < (share / farther**2)[number]
     left = np.bincount(number[keep], minlength=count)
-    keep |= (left < FEWEST)[number]
-    farther = np.where(left < FEWEST, 1.0, farther)
-    middles = _means(points[:, :2].astype(np.float64), number, count)
-    ways = middles * (farther - 1)[:, None]
-    points[:, :2] += ways[number].astype(np.float32)
-    boxes[:, :2] += ways
+    keep |= (left < MIN_POINTS_LEFT)[number]
+    farther = np.where(left < MIN_POINTS_LEFT, 1.0, farther)
+    centres = _group_means(points[:, :2].astype(np.float64), number, count)
+    shifts = centres * (farther - 1)[:, None]
+    points[:, :2] += shifts[number].astype(np.float32)
+    boxes[:, :2] += shifts
     scale = 1 + rng.uniform(-params.scale, params.scale)
     height = rng.uniform(-params.height, params.height)
     floor = clusters.floor
@@ -128,12 +158,12 @@ def changed(clusters: Clusters, boxes: np.ndarray, loose: np.ndarray,
     boxes[:, :6] *= scale
     points[:, 2] += floor[number].astype(np.float32)
     boxes[:, 2] += floor
-    # The ground is known to so much only.
+    # The height of the ground is uncertain.
     floor = floor + height + rng.uniform(-0.5, 0.5, count) * params.height
     if rng.random() < params.flip:
         points[:, 1] *= -1
         boxes[:, [1, 6]] *= -1
-    points = noisy(points, params, rng)
+    points = add_range_noise(points, params, rng)
     gain = rng.uniform(1 - params.intensity, 1 + params.intensity)
     points[:, 3] = np.clip(points[:, 3] * gain, 0, 1)
     sizes = np.bincount(number[keep], minlength=count)
@@ -141,14 +171,14 @@ def changed(clusters: Clusters, boxes: np.ndarray, loose: np.ndarray,
     return Clusters(points[keep], first, clusters.ids, floor), boxes
 
 
-def _means(values: np.ndarray, number: np.ndarray, count: int) -> np.ndarray:
-    """(count, D) means of values (P, D) by number (P,); 0 where there are none."""
+def _group_means(values: np.ndarray, number: np.ndarray, count: int) -> np.ndarray:
+    """Return the means (count, D) of values (P, D) by group number (P,), 0 for empty groups."""
     sums = np.stack([np.bincount(number, column, minlength=count) for column in values.T], axis=1)
     return sums / np.maximum(np.bincount(number, minlength=count), 1)[:, None]
 
 
 def make_loss(config: PointNetConfig, device: torch.device) -> Callable:
-    """loss(network, samples) -> total, parts, as the loop wants it."""
+    """Return loss(network, samples) -> (total, parts), see Task."""
     def tensor(arrays: Sequence[np.ndarray]) -> Tensor:
         return torch.from_numpy(np.concatenate(arrays)).to(device)
 
@@ -168,8 +198,10 @@ def make_loss(config: PointNetConfig, device: torch.device) -> Callable:
 
 @dataclass(frozen=True)
 class ValidationClusters:
-    """A scene to validate on: the clusters that clustering made, with the truth of its frame.
-    height: of its sensor, metres."""
+    """A scene to validate on: the clusters that clustering made, and the truth of the frame.
+
+    labels: (K,) int64; height: height of the sensor in metres.
+    """
 
     name: str
     clusters: Clusters
@@ -179,8 +211,8 @@ class ValidationClusters:
     height: float = SENSOR_HEIGHT
 
 
-def clusters_to_validate(source: CutScenes, i: int) -> ValidationClusters:
-    """Scene i of a source, to validate on. InputError naming the file that cannot be used."""
+def load_validation_clusters(source: CutScenes, i: int) -> ValidationClusters:
+    """Return scene i of a source. Raise InputError, naming the file, if it cannot be used."""
     scene = source.scene(i)
     made = np.flatnonzero(~scene.loose)
     frame = source.frame(i)
@@ -188,11 +220,15 @@ def clusters_to_validate(source: CutScenes, i: int) -> ValidationClusters:
                               frame.truth(), frame.calibration(), frame.sensor_height)
 
 
-def validated(network: PointNet, scenes: Sequence[ValidationClusters]) -> Judged:
-    """Calibrate the network on the scenes, one at least, and score it, see Task: score, the mean AP
-    from above at the relaxed overlaps (moderate, R40), and each class's; accuracy, the share of
-    clusters of SCORED_POINTS or more, and of the objects among them, whose class is right, NaN
-    without any. Scenes may have no cluster."""
+def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) -> Validation:
+    """Calibrate the network on one or more scenes, and score it.
+
+    Returns:
+        Metrics and calibration, see Task.validate. The score is the mean BEV AP at the relaxed
+        overlaps (moderate, R40). The accuracies are shares of clusters with at least
+        MIN_SCORED_POINTS points, and of the objects among them, whose class is correct; NaN
+        without any.
+    """
     config = network.config
     labels = np.concatenate([s.labels for s in scenes])
     sizes = np.concatenate([s.clusters.sizes for s in scenes])
@@ -207,8 +243,8 @@ def validated(network: PointNet, scenes: Sequence[ValidationClusters]) -> Judged
         boxes = found(predictions[-1], config, [MIN_SCORE] * len(config.classes))
         boxes = as_found(boxes, SensorPoseParams(height=scene.height))
         report.update(Detected(scene.name, scene.truth, boxes, scene.calibration))
-    metrics, calibration = judged(report, "bev", config.classes)
-    known = (labels >= 0) & (sizes >= SCORED_POINTS)
+    metrics, calibration = summarize_report(report, "bev", config.classes)
+    known = (labels >= 0) & (sizes >= MIN_SCORED_POINTS)
     probabilities = np.concatenate([p.probabilities for p in predictions])[known]
     right, objects = probabilities.argmax(axis=1) == labels[known], labels[known] < len(
         config.classes)
@@ -218,20 +254,33 @@ def validated(network: PointNet, scenes: Sequence[ValidationClusters]) -> Judged
 
 
 def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches,
-              validation: ReadScenes, out: Path, device: torch.device, about: dict[str, Any],
+              validation: SceneReader, out: Path, device: torch.device, about: dict[str, Any],
               commit: str = "", init: Path | None = None) -> Task[PointNet]:
-    """The task of training a network of a config; see training.pointpillars.make_task."""
+    """Return the task of training a network.
+
+    Args:
+        config: Configuration of the network.
+        params: Parameters of the training.
+        batches: Samples to train on.
+        validation: Scenes to validate on.
+        out: Folder for best.safetensors and last.safetensors.
+        device: Device of the network.
+        about: Description of the data for the header; a resumed run must have the same.
+        commit: Version of the code for the header.
+        init: Checkpoint to start from, see checkpoint.adopt.
+    """
     torch.manual_seed(params.seed)
-    network = begun_with(make_pointnet(config), init, PointNetConfig).to(device)
+    network = load_initial_weights(make_pointnet(config), init, PointNetConfig).to(device)
     scenes: list[ValidationClusters] = []
 
-    def validate(module: PointNet) -> Judged:
+    def validate(module: PointNet) -> Validation:
         if not scenes:
-            items = [item for item, in loaded(validation, ([n] for n in range(len(validation))),
-                                              batches.jobs)]
+            items = [item for item, in load_items(
+                validation, ([n] for n in range(len(validation))), batches.jobs)]
             scenes.extend(item.sample for item in items if item.sample is not None)
-            name_skipped([reason for item in items for reason in item.skipped], len(scenes), set())
-        return validated(module, scenes)
+            report_skipped([reason for item in items for reason in item.skipped], len(scenes),
+                           set())
+        return validate_network(module, scenes)
 
     return Task(network, make_loss(config, device), batches, validate,
-                keeper(out, config, params, batches, about, commit), batches.epoch, about)
+                make_save(out, config, params, batches, about, commit), batches.epoch, about)

@@ -1,1 +1,1 @@
-"""What PointPillars is trained with."""
+"""Training of PointPillars."""

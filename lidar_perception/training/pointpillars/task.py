@@ -1,4 +1,4 @@
-"""What PointPillars brings to the training loop: its samples, loss, validation and checkpoints."""
+"""The training task of PointPillars: samples, loss and validation."""
 
 from __future__ import annotations
 
@@ -47,13 +47,23 @@ from lidar_perception.runs.terminal import track
 from lidar_perception.scoring.detections import Detected, detected
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.training.augment import TrainingScene, augmented, faced, raised
-from lidar_perception.training.data import Batches, ReadScenes, loaded
-from lidar_perception.training.database import Database, with_objects
+from lidar_perception.training.augment import (
+    TrainingScene,
+    augment_scene,
+    raise_scene,
+    turn_and_crop,
+)
+from lidar_perception.training.data import Batches, SceneReader, load_items
+from lidar_perception.training.database import Database, paste_objects
 from lidar_perception.training.params import AugmentParams, PointPillarsTraining
-from lidar_perception.training.putting import inside
-from lidar_perception.training.record import begun_with, judged, keeper, name_skipped
-from lidar_perception.training.run import Judged, Task
+from lidar_perception.training.pasting import find_points_in_box
+from lidar_perception.training.record import (
+    load_initial_weights,
+    make_save,
+    report_skipped,
+    summarize_report,
+)
+from lidar_perception.training.run import Task, Validation
 from lidar_perception.types import (
     CLASSES,
     SENSOR_HEIGHT,
@@ -63,20 +73,27 @@ from lidar_perception.types import (
     LidarFrame,
 )
 
-# Boxes of low score cost precision only where recall has ended; fewer of them are quicker.
-VALIDATED = DetectorParams(pointpillars=PointPillarsParams(scores=ScoreParams.all_alike(0.1),
-                                                           warm_up=False))
-LIKE = {other: name for name, other in NEIGHBOURS.items()}  # Van: Car, Person_sitting: Pedestrian
-TOUCHED = 1e-6  # overlap of an anchor that touches
-REGION = -2  # label of a box of the class DontCare
+# Boxes of low score hardly change the AP, and validation is quicker without them.
+VALIDATION_PARAMS = DetectorParams(pointpillars=PointPillarsParams(
+    scores=ScoreParams.all_alike(0.1), warm_up=False))
+# Similar class: the class, such as Van: Car, Person_sitting: Pedestrian.
+CLASS_BY_SIMILAR = {other: name for name, other in NEIGHBOURS.items()}
+MIN_TOUCH_IOU = 1e-6  # of an anchor that touches a box
+DONT_CARE_LABEL = -2  # of a box of the class DontCare
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One scene for the network: points and cluster_map as in expert.NetworkInput; boxes (M, 7)
-    float32, labels (M,) int64 into the config's classes, REGION for a region of which nothing is
-    learned; counted (M,) bool: to be found, the others may be found or not; targets: what of
-    them is to be found at which anchors, made here as many processes prepare and one trains."""
+    """One scene for the network.
+
+    Attributes:
+        points, cluster_map: See expert.NetworkInput.
+        boxes: (M, 7) float32.
+        labels: (M,) int64 into the config's classes; DONT_CARE_LABEL for a region without labels.
+        counted: (M,) bool, the object must be found; the others may be found or not.
+        targets: Targets of the anchors, made with the sample since several processes make samples
+            and one trains.
+    """
 
     points: np.ndarray
     cluster_map: np.ndarray | None
@@ -87,9 +104,15 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Preparation:
-    """scene, rng -> Sample: augmented, cropped to what the network sees, with the experts' columns.
-    database: file of objects to put in, or None."""
+class ScenePreparation:
+    """Makes a Sample of a scene: augmented, cropped to the detection range, with expert columns.
+
+    Attributes:
+        config: Configuration of the network.
+        augment: Limits of the changes.
+        min_points: Objects with fewer points need not be found.
+        database: File of objects to paste, or None.
+    """
 
     config: NetworkConfig
     augment: AugmentParams
@@ -108,42 +131,48 @@ class Preparation:
         return {k: v for k, v in self.__dict__.items() if k not in ("_objects", "_anchors")}
 
     def __call__(self, scene: TrainingScene, rng: np.random.Generator) -> Sample:
-        """InputError if the network would see no point."""
-        lower = np.array([0, 0, scene.height - SENSOR_HEIGHT])  # than what the network sees
-        low, high = np.array(self.config.low) - lower, np.array(self.config.high) - lower
-        scene = faced(scene, self.augment, low, high, rng)
+        """Prepare a scene. Raise InputError if no point is in the detection range."""
+        lift = np.array([0, 0, scene.height - SENSOR_HEIGHT])  # to a sensor at SENSOR_HEIGHT
+        low, high = np.array(self.config.low) - lift, np.array(self.config.high) - lift
+        scene = turn_and_crop(scene, self.augment, low, high, rng)
         if self._objects is not None and rng.random() < self.augment.crowded:
-            scene = with_objects(scene, self._objects, self.augment, low, high, rng)
-        scene = augmented(scene, self.augment, rng)
+            scene = paste_objects(scene, self._objects, self.augment, low, high, rng)
+        scene = augment_scene(scene, self.augment, rng)
         frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
         _, seen = visible(frame, self.config, SensorPoseParams(height=scene.height))
         inputs = network_input(seen, self.config)
         if len(inputs.points) < 2:
-            raise InputError("a scene has no point where the network looks")
-        boxes, labels, counted = self._objects_to_find(raised(scene, lower[2]), seen.xyz)
-        targets = _targets(boxes, labels, counted, self._anchors, self.config)
+            raise InputError("a scene has no point in the detection range")
+        boxes, labels, counted = self._select_objects(raise_scene(scene, lift[2]), seen.xyz)
+        targets = _assign_targets(boxes, labels, counted, self._anchors, self.config)
         return Sample(inputs.points, inputs.cluster_map, boxes, labels, counted, sparse(targets))
 
-    def _objects_to_find(self, scene: TrainingScene, xyz: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _select_objects(self, scene: TrainingScene, xyz: np.ndarray) -> tuple[np.ndarray, ...]:
         low, high = np.array(self.config.low), np.array(self.config.high)
         names = [CLASSES[i] for i in scene.class_ids]
-        labels = np.array([self._label(LIKE.get(name, name)) for name in names], np.int64)
+        labels = np.array([self._label(CLASS_BY_SIMILAR.get(name, name)) for name in names],
+                          np.int64)
         kept = np.flatnonzero(within(scene.boxes, low, high) & (labels != -1))
-        counted = [bool(scene.wanted[i]) and names[i] not in LIKE and labels[i] != REGION
-                   and len(inside(xyz, scene.boxes[i], 0.0)) >= self.min_points
+        counted = [bool(scene.wanted[i]) and names[i] not in CLASS_BY_SIMILAR
+                   and labels[i] != DONT_CARE_LABEL
+                   and len(find_points_in_box(xyz, scene.boxes[i], 0.0)) >= self.min_points
                    for i in kept]
         return scene.boxes[kept].astype(np.float32), labels[kept], np.array(counted, bool)
 
     def _label(self, name: str) -> int:
         if name == CLASSES[DONT_CARE]:
-            return REGION
+            return DONT_CARE_LABEL
         return self.config.classes.index(name) if name in self.config.classes else -1
 
 
-def narrowed(config: NetworkConfig, ahead: float, aside: float) -> NetworkConfig:
-    """The config with a range that ends so far ahead, and behind if it sees what is there, and to
-    each side, metres, made longer to whole cells of the coarsest map, and at most as far as before;
-    0 leaves it."""
+def reduce_range(config: NetworkConfig, ahead: float, aside: float) -> NetworkConfig:
+    """Return the config with a shorter detection range, rounded up to whole cells.
+
+    Args:
+        config: Configuration of a network.
+        ahead: Range ahead, and behind if the config covers that, in metres; 0 keeps it.
+        aside: Range to each side in metres; 0 keeps it.
+    """
     step = config.cell * np.prod(config.block_strides)
 
     def whole(length: float) -> float:
@@ -159,32 +188,36 @@ def narrowed(config: NetworkConfig, ahead: float, aside: float) -> NetworkConfig
     return replace(config, low=(back, right, bottom), high=(front, left, top))
 
 
-def _targets(boxes: np.ndarray, labels: np.ndarray, counted: np.ndarray, anchors: Tensor,
-             config: NetworkConfig) -> Targets:
-    """The targets of one sample. Anchors on objects that are not counted, and those of any class
-    that touch a region, are neither object nor background."""
-    boxes_of, kinds, wanted = map(torch.from_numpy, (boxes, labels, counted))
-    targets = assign(anchors, config, boxes_of[wanted], kinds[wanted])
-    found = targets.labels[0]
+def _assign_targets(boxes: np.ndarray, labels: np.ndarray, counted: np.ndarray, anchors: Tensor,
+                    config: NetworkConfig) -> Targets:
+    """Return the targets of one sample.
+
+    Anchors on objects that do not count, and those of any class that touch a DontCare region, are
+    neither object nor background.
+    """
+    all_boxes, classes, wanted = map(torch.from_numpy, (boxes, labels, counted))
+    targets = assign(anchors, config, all_boxes[wanted], classes[wanted])
+    anchor_labels = targets.labels[0]
     for index, spec in enumerate(config.anchors):
-        for others, least in ((boxes_of[~wanted & (kinds == index)], spec.unmatched),
-                              (boxes_of[kinds == REGION], TOUCHED)):
-            mine = anchors_near(anchors, config, others, index)
-            if len(mine):
-                near = nearest_axis_iou(anchors[mine], others).max(dim=1).values >= least
-                near &= found[mine] == BACKGROUND
-                found[mine[near]] = IGNORED
+        for others, min_iou in ((all_boxes[~wanted & (classes == index)], spec.unmatched),
+                                (all_boxes[classes == DONT_CARE_LABEL], MIN_TOUCH_IOU)):
+            candidates = anchors_near(anchors, config, others, index)
+            if len(candidates):
+                ignored = (nearest_axis_iou(anchors[candidates], others).max(dim=1).values
+                           >= min_iou)
+                ignored &= anchor_labels[candidates] == BACKGROUND
+                anchor_labels[candidates[ignored]] = IGNORED
     return targets
 
 
 def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
-    """loss(network, samples) -> total, parts, as the loop wants it."""
+    """Return loss(network, samples) -> (total, parts), see Task."""
     classes = anchor_classes(config, device)
 
     def loss(network: nn.Module, samples: Sequence[Sample]) -> tuple[Tensor, dict[str, Tensor]]:
         pillars = make_pillars([torch.from_numpy(s.points).to(device) for s in samples], config)
-        drawn = [s.cluster_map for s in samples if s.cluster_map is not None]
-        maps = torch.from_numpy(np.stack(drawn)).to(device) if drawn else None
+        cluster_maps = [s.cluster_map for s in samples if s.cluster_map is not None]
+        maps = torch.from_numpy(np.stack(cluster_maps)).to(device) if cluster_maps else None
         targets = dense([sample.targets for sample in samples], len(classes), device)
         losses = detection_loss(network(pillars, maps), targets, classes)
         return losses.total, {"classes": losses.classes.detach(), "boxes": losses.boxes.detach(),
@@ -193,56 +226,72 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
     return loss
 
 
-def frame_to_validate(config: NetworkConfig, source: Any, i: int) -> Frame:
-    """Frame i of a source, read. Where no camera says what is labelled, with the labels that a
-    network of the config is taught: those whose centre it sees. InputError naming the file that
-    cannot be used."""
+def load_validation_frame(config: NetworkConfig, source: Any, i: int) -> Frame:
+    """Load frame i of a source.
+
+    Without a camera, only labels whose centre is in the detection range stay, since the network is
+    trained on these.
+
+    Raises:
+        InputError: A file cannot be used; the message names it.
+    """
     frame = source.frame(i)
     truth, calibration = frame.truth(), frame.calibration()
     if calibration is None and truth is not None:
-        seen = np.flatnonzero(within(truth.boxes, config.low, config.high))
-        truth = GroundTruth.of(truth.boxes[seen], truth.class_ids[seen],
-                               [truth.extras[k] for k in seen], truth.notes)
+        kept = np.flatnonzero(within(truth.boxes, config.low, config.high))
+        truth = GroundTruth.of(truth.boxes[kept], truth.class_ids[kept],
+                               [truth.extras[k] for k in kept], truth.notes)
     return Frame.of(frame.name, frame.load(), truth, calibration,
                     sensor_height=frame.sensor_height)
 
 
-def validation_report(detector: Detector, scenes: ReadScenes, jobs: int = 0) -> DetectionReport:
-    """The detector on every scene, by KITTI's protocol."""
+def validate_detector(detector: Detector, scenes: SceneReader, jobs: int = 0) -> DetectionReport:
+    """Evaluate a detector on every scene by KITTI's protocol."""
     report = DetectionReport()
-    items = loaded(scenes, ([n] for n in range(len(scenes))), jobs)
+    items = load_items(scenes, ([n] for n in range(len(scenes))), jobs)
     for item, in track(items, "validating", len(scenes)):
         report.skipped += item.skipped
         if item.sample is not None:
-            report.update(found_in(item.sample, detector))
+            report.update(detect_in_frame(item.sample, detector))
     return report
 
 
-def found_in(frame: Frame, detector: Detector) -> Detected[Detections]:
-    """What a detector says of a frame that is read, as from the height of its sensor."""
+def detect_in_frame(frame: Frame, detector: Detector) -> Detected[Detections]:
+    """Run a detector on a loaded frame, at the height of its sensor."""
     height = frame.sensor_height
-    at = detector if height == SENSOR_HEIGHT else detector.mounted_at(height)
-    return detected(at, frame, frame.truth(), frame.calibration())
+    if height != SENSOR_HEIGHT:
+        detector = detector.mounted_at(height)
+    return detected(detector, frame, frame.truth(), frame.calibration())
 
 
 def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batches,
-              validation: ReadScenes, out: Path, device: torch.device, about: dict[str, Any],
+              validation: SceneReader, out: Path, device: torch.device, about: dict[str, Any],
               commit: str = "", init: Path | None = None) -> Task[PointPillars]:
-    """The task of training a network of a config. about: what the header says of the data; a
-    resumed run must have the same. init: checkpoint to begin with, see checkpoint.adopt. Weights
-    are written to out/best.safetensors and out/last.safetensors."""
+    """Return the task of training a network.
+
+    Args:
+        config: Configuration of the network.
+        params: Parameters of the training.
+        batches: Samples to train on.
+        validation: Scenes to validate on.
+        out: Folder for best.safetensors and last.safetensors.
+        device: Device of the network.
+        about: Description of the data for the header; a resumed run must have the same.
+        commit: Version of the code for the header.
+        init: Checkpoint to start from, see checkpoint.adopt.
+    """
     torch.manual_seed(params.seed)
-    network = begun_with(make_network(config), init, NetworkConfig)
+    network = load_initial_weights(make_network(config), init, NetworkConfig)
     network = channels_last(network.to(device))
-    named: set[str] = set()
+    reported: set[str] = set()
 
-    def validate(module: PointPillars) -> Judged:
+    def validate(module: PointPillars) -> Validation:
         detector = PointPillarsDetector(TorchNetwork(module, device), Header(config), device,
-                                        VALIDATED)
-        report = validation_report(detector, validation, batches.jobs)
-        name_skipped(report.skipped, len(report.frames), named)
-        return judged(report, params.score, config.classes)
+                                        VALIDATION_PARAMS)
+        report = validate_detector(detector, validation, batches.jobs)
+        report_skipped(report.skipped, len(report.frames), reported)
+        return summarize_report(report, params.score, config.classes)
 
-    seen = narrowed(config, params.ahead, params.aside)
-    return Task(network, make_loss(seen, device), batches, validate,
-                keeper(out, config, params, batches, about, commit), batches.epoch, about)
+    reduced = reduce_range(config, params.ahead, params.aside)
+    return Task(network, make_loss(reduced, device), batches, validate,
+                make_save(out, config, params, batches, about, commit), batches.epoch, about)

@@ -1,4 +1,4 @@
-"""Several processes that train one network, as torchrun starts them; one process is rank 0 of 1."""
+"""Training one network in several processes that torchrun starts; one process is rank 0 of 1."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from datetime import timedelta
 import torch
 from torch import distributed
 
-PATIENCE = timedelta(hours=2)  # of the others, while rank 0 validates
+TIMEOUT = timedelta(hours=2)  # the other processes wait this long while rank 0 validates
 
 
 @contextmanager
-def joined(device: torch.device) -> Iterator[torch.device]:
-    """Join the processes that torchrun started, if it did, and if that was not done by the caller;
-    gives the device of this one."""
+def join_process_group(device: torch.device) -> Iterator[torch.device]:
+    """Join the processes that torchrun started, if any, and yield the device of this process."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield device
         return
@@ -26,42 +25,42 @@ def joined(device: torch.device) -> Iterator[torch.device]:
     if distributed.is_initialized():
         yield device
         return
-    distributed.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=PATIENCE)
+    distributed.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=TIMEOUT)
     try:
         yield device
     finally:
         distributed.destroy_process_group()
 
 
-def rank() -> int:
-    """The number of this process, from 0."""
+def get_rank() -> int:
+    """Return the number of this process, from 0."""
     return distributed.get_rank() if distributed.is_initialized() else 0
 
 
-def world() -> int:
-    """How many processes there are."""
+def get_world_size() -> int:
+    """Return the number of processes."""
     return distributed.get_world_size() if distributed.is_initialized() else 1
 
 
-def any_of(flag: bool, device: torch.device) -> bool:
-    """Whether flag is true in any process; all must ask."""
-    if world() == 1:
+def is_true_anywhere(flag: bool, device: torch.device) -> bool:
+    """Return True if flag is true in any process. Every process must call this."""
+    if get_world_size() == 1:
         return flag
     value = torch.tensor(int(flag), device=device)
     distributed.all_reduce(value, distributed.ReduceOp.MAX)
     return bool(value.item())
 
 
-def least(number: float, device: torch.device) -> float:
-    """The least of the numbers that all processes give."""
-    if world() == 1:
+def find_minimum(number: float, device: torch.device) -> float:
+    """Return the smallest number of all processes. Every process must call this."""
+    if get_world_size() == 1:
         return number
     value = torch.tensor(number, device=device)
     distributed.all_reduce(value, distributed.ReduceOp.MIN)
     return float(value.item())
 
 
-def wait() -> None:
-    """Until all processes are here."""
-    if world() > 1:
+def wait_for_all() -> None:
+    """Wait until every process has called this."""
+    if get_world_size() > 1:
         distributed.barrier()

@@ -1,0 +1,276 @@
+"""Fitting of the fused detector's curves to simulated scans of a sensor.
+
+The curves turn the evidence of PointPillars, silhouettes and the PointNet into one probability, see
+detectors/fused/model.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidar_perception.classes import CAR, DETECTED
+from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.checkpoint import NETWORKS, Header
+from lidar_perception.detectors.fused.detector import FusedDetector, Look, load_fused_detector
+from lidar_perception.detectors.fused.evidence import Evidence
+from lidar_perception.detectors.fused.fusion import KNOTS, Models, package_models, write_fusion
+from lidar_perception.detectors.fused.model import probabilities
+from lidar_perception.detectors.fused.params import FusedDetectorParams, FusedParams
+from lidar_perception.detectors.params import ScoreParams
+from lidar_perception.geometry import bev_iou, centre_distances
+from lidar_perception.runs.processes import in_processes
+from lidar_perception.runs.terminal import errors, track
+from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
+from lidar_perception.simulation.scene import Scenes
+from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.training.curves import fit_curves
+from lidar_perception.training.params import FusedTraining
+from lidar_perception.training.scenes import SimulatedScenes
+from lidar_perception.training.sources import FIRST_FITTED_SCENE
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError
+
+MAX_CENTRE_DISTANCE_M = 0.5  # of a hit on a pedestrian or cyclist
+MIN_SAMPLES = 20  # correct proposals of a class, and as many wrong ones, to fit curves to
+MIN_PROBABILITY = 1e-6  # in the log loss
+# Of weights whose header names no sensor and scene.
+DEFAULT_SENSOR, DEFAULT_SCENE = "hdl64e", "street"
+
+
+@dataclass(frozen=True)
+class Samples:
+    """K proposals.
+
+    Attributes:
+        class_ids: (K,) int into CLASSES.
+        right: (K,) bool, the proposal is correct.
+        scans: (K,) int, number of the scan.
+        evidence: (K,) of each source, by name.
+    """
+
+    class_ids: np.ndarray
+    right: np.ndarray
+    scans: np.ndarray
+    evidence: Evidence
+
+    def take(self, chosen: np.ndarray) -> Samples:
+        """Return the proposals of a mask or of indices."""
+        return Samples(self.class_ids[chosen], self.right[chosen], self.scans[chosen],
+                       {name: odds[chosen] for name, odds in self.evidence.items()})
+
+    @staticmethod
+    def concatenate(parts: Sequence[Samples]) -> Samples:
+        """Return the proposals of all parts, one at least."""
+        join = np.concatenate
+        return Samples(join([part.class_ids for part in parts]),
+                       join([part.right for part in parts]),
+                       join([part.scans for part in parts]),
+                       {name: join([part.evidence[name] for part in parts])
+                        for name in parts[0].evidence})
+
+
+class CurveScore(NamedTuple):
+    """Mean log loss of curves, and their correct and wrong proposals above the threshold."""
+
+    loss: float
+    right: int
+    wrong: int
+
+
+class ClassFit(NamedTuple):
+    """Result of fitting one class.
+
+    Attributes:
+        proposals, right: Number of proposals, and of correct ones.
+        before: Score of the previous curves.
+        after: Score of curves fitted to the other half of the scans; None with too few proposals.
+    """
+
+    proposals: int
+    right: int
+    before: CurveScore
+    after: CurveScore | None
+
+
+def fit_fusion(weights: Path | None, classifier: Path | None, out: Path, params: FusedTraining,
+               jobs: int = 1) -> dict[str, ClassFit]:
+    """Fit the curves of two networks to simulated scans, and write a fusion file.
+
+    Args:
+        weights: Checkpoint of PointPillars; None for the packaged one.
+        classifier: Checkpoint of the PointNet; None for the packaged one.
+        out: File to write, see detectors/fused/fusion.py.
+        params: Scans to simulate.
+        jobs: Number of processes.
+
+    Returns:
+        The fit of each class.
+
+    Raises:
+        InputError: Something cannot be used. Raised before a scan is simulated.
+    """
+    own = FusedParams(weights=str(weights or ""), classifier=str(classifier or ""),
+                      range=params.range, threads=1, warm_up=False)
+    detector = load_fused_detector("", "cpu", FusedDetectorParams(fused=own))
+    header, other = detector.header, detector.classifier.header
+    params = fill_from_header(params, header)
+    sensor = sensor_named(params.sensor, params.mount_height or _find_trained_height(header))
+    scenes = Scenes(None, params.people, params.scene)
+    scenes.sorts()  # raises InputError for an unknown one
+    around = bool(detector.config.low[0] < 0)
+    errors.print(f"{params.scans} {params.scene} scans of {params.sensor} at {sensor.height:g} m, "
+                 f"{'all around' if around else 'ahead'}")
+    for network in header, other:
+        if warning := network.unlike(sensor.height):
+            errors.print(f"{NETWORKS[network.network][0]}: {warning}")
+    source = SimulatedScenes(FIRST_FITTED_SCENE, params.scans, sensor, scenes, around=around)
+    models, fits = fit_classes(simulate_samples(FusedDetectorParams(fused=own), source, jobs),
+                               package_models())
+    write_fusion(out, (weights, classifier), models, {
+        "sensor": params.sensor, "height": sensor.height, "scene": params.scene,
+        "scans": params.scans, "range": "around" if around else "ahead",
+        "proposals, hits": {name: [fit.proposals, fit.right] for name, fit in fits.items()}})
+    return fits
+
+
+def fill_from_header(params: FusedTraining, header: Header) -> FusedTraining:
+    """Fill an empty sensor and scene with those that the weights were trained on.
+
+    Raises:
+        InputError: The file of that sensor is missing.
+    """
+    sensor, trained = _read_sensor(header), header.training.get("params")
+    name = sensor.get("name") or DEFAULT_SENSOR
+    if not params.sensor and Path(name).suffix in (".yaml", ".yml") and not Path(name).is_file():
+        raise InputError(f"the weights are for the sensor {name}, which is missing; give its path, "
+                         "or another sensor, with --sensor")
+    return replace(
+        params, sensor=params.sensor or name,
+        scene=params.scene or (trained.get("scene") if isinstance(trained, dict) else "")
+        or DEFAULT_SCENE)
+
+
+def _find_trained_height(header: Header) -> float:
+    """Return the sensor height in metres that the weights were trained for, 0 if unknown."""
+    height = _read_sensor(header).get("height")
+    return height if isinstance(height, float) else 0.0
+
+
+def _read_sensor(header: Header) -> dict[str, Any]:
+    sensor = header.training.get("sensor")
+    return sensor if isinstance(sensor, dict) else {}
+
+
+def collect_samples(frame: Frame, look: Look, scan: int) -> Samples:
+    """Return the proposals of a simulated frame that count, and whether each is correct.
+
+    Proposals outside the image do not count if there is a camera. Of several correct ones about an
+    object only the best counts, as only one is kept. Proposals on objects that merely resemble the
+    class (a van for a car) do not count, as in the evaluation of detections.
+    """
+    truth, camera, found = frame.truth(), frame.camera(), look.proposed
+    assert truth is not None  # simulated scans always have it
+    centres = found.boxes[:, :3] - np.array([0, 0, frame.sensor_height - SENSOR_HEIGHT], np.float32)
+    in_view = np.ones(len(found), bool) if camera is None else camera.in_view(centres)
+    kept, right = [], []
+    for class_id in np.unique(found.class_ids):
+        own = np.flatnonzero((found.class_ids == class_id) & in_view)
+        own = own[np.argsort(-found.scores[own], kind="stable")]
+        name, boxes = CLASSES[class_id], found.boxes[own]
+        hits = _match_boxes(boxes, truth.of_class(class_id), name)
+        similar = truth.of_class(CLASSES.index(NEIGHBOURS.get(name, name)))
+        taken = np.zeros(hits.shape[1], bool)
+        for i, hit, similar_hit in zip(own, hits, _match_boxes(boxes, similar, name)):
+            free = np.flatnonzero(hit & ~taken)
+            if not len(free) and (hit.any() or similar_hit.any()):
+                continue  # on an object that is found already, or on a similar one
+            taken[free[:1]] = True
+            kept.append(i)
+            right.append(len(free) > 0)
+    chosen = np.array(kept, np.int64)
+    return Samples(found.class_ids[chosen], np.array(right, bool), np.full(len(chosen), scan),
+                   {name: odds[chosen] for name, odds in look.evidence.items()})
+
+
+def _match_boxes(boxes: np.ndarray, objects: np.ndarray, name: str) -> np.ndarray:
+    """Return (K, M) bool: which boxes (K, 7) of a class are correct about which objects (M, 7)."""
+    hits = bev_iou(boxes, objects) > DETECTED[name].relaxed
+    if name != CLASSES[CAR]:
+        hits |= centre_distances(boxes, objects) < MAX_CENTRE_DISTANCE_M
+    return hits
+
+
+def simulate_samples(params: FusedDetectorParams, scenes: SimulatedScenes, jobs: int) -> Samples:
+    """Return the proposals in all scans; the same for any number of processes."""
+    parts = sorted(track(in_processes(partial(_make_sampler, params, scenes), range(len(scenes)),
+                                      jobs, "detected in simulated scans"),
+                         "simulating and detecting", len(scenes)), key=lambda part: part[0])
+    return Samples.concatenate([part for _, part in parts])
+
+
+def _make_sampler(params: FusedDetectorParams,
+                  scenes: SimulatedScenes) -> Callable[[int], tuple[int, Samples]]:
+    detector: FusedDetector = load_fused_detector("", "cpu", params)
+
+    def sample_scan(i: int) -> tuple[int, Samples]:
+        frame = scenes.frame(i)
+        proposals = detector.mounted_at(frame.sensor_height).look(frame.load())
+        return i, collect_samples(frame, proposals, i)
+    return sample_scan
+
+
+def fit_classes(samples: Samples, before: Models) -> tuple[Models, dict[str, ClassFit]]:
+    """Fit the curves of each class, and score old and new ones on scans they were not fitted to.
+
+    Classes with too few samples keep the curves of before, if it has any.
+    """
+    models, fits = dict(before), {}
+    for name in DETECTED:
+        own = samples.take(samples.class_ids == CLASSES.index(name))
+        after = None
+        if has_enough_samples(own):
+            models[name] = fit_class(name, own)
+            after = _cross_validate(name, own)
+        fits[name] = ClassFit(len(own.right), int(own.right.sum()),
+                              _score(own, probabilities(before, own.class_ids, own.evidence)),
+                              after)
+    return models, fits
+
+
+def has_enough_samples(own: Samples) -> bool:
+    """Return True with enough correct and wrong proposals in both halves of the scans."""
+    halves = [own.right[own.scans % 2 == half] for half in range(2)]
+    return all(min(right.sum(), (~right).sum()) >= MIN_SAMPLES / 2 for right in halves)
+
+
+def fit_class(name: str, own: Samples) -> dict:
+    """Return the model of a class, fitted to its proposals."""
+    knots = {source: k for source, k in KNOTS.items()
+             if (source, name) != ("silhouette", CLASSES[CAR])}
+    features = {source: own.evidence[source] for source in knots}
+    return fit_curves(features, own.right, np.ones(len(own.right)), knots,
+                      dict.fromkeys(knots, 1))
+
+
+def _cross_validate(name: str, own: Samples) -> CurveScore:
+    scores = np.zeros(len(own.right), np.float32)
+    for half in range(2):
+        in_half = own.scans % 2 == half
+        model = {name: fit_class(name, own.take(~in_half))}
+        left_out = own.take(in_half)
+        scores[in_half] = probabilities(model, left_out.class_ids, left_out.evidence)
+    return _score(own, scores)
+
+
+def _score(own: Samples, scores: np.ndarray) -> CurveScore:
+    if not len(scores):
+        return CurveScore(0.0, 0, 0)
+    likelihood = np.where(own.right, scores, 1 - scores)
+    passed = scores >= ScoreParams().of_class(CLASSES[own.class_ids[0]])
+    return CurveScore(float(-np.log(np.maximum(likelihood, MIN_PROBABILITY)).mean()),
+                      int((passed & own.right).sum()), int((passed & ~own.right).sum()))

@@ -1,0 +1,197 @@
+"""Planning of a training run on this machine: measure its speed, fit the steps, and report."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+
+from lidar_perception.detectors.checkpoint import HEIGHT_APART
+from lidar_perception.param_fields import with_values
+from lidar_perception.runs.machine import cores
+from lidar_perception.runs.terminal import duration, errors
+from lidar_perception.simulation.sensor import Sensor
+from lidar_perception.training.data import Item, SceneReader
+from lidar_perception.training.distributed import get_world_size
+from lidar_perception.training.plan import (
+    STARTUP_S,
+    Data,
+    Plan,
+    Speed,
+    fit_plan,
+    preparation_duration,
+    shorten_plan,
+    training_durations,
+)
+from lidar_perception.training.request import TrainingRequest
+from lidar_perception.training.run_directory import PlannedRun
+from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes
+from lidar_perception.training.sources import open_sources
+from lidar_perception.training.timing import MAX_TIMED_SCENES
+from lidar_perception.training.trainer import Trainer
+from lidar_perception.types import InputError
+
+DEFAULT_BUDGET_H = 2.0
+MIN_FREE_GB = 0.5  # on the disk
+
+
+@dataclass(frozen=True)
+class Planner:
+    """Plans the run of a request. params: parameters as requested, without a plan."""
+
+    trainer: Trainer
+    request: TrainingRequest
+    params: Any
+    sensor: Sensor
+    device: torch.device
+
+    def make_plan(self, settings: dict[str, Any]) -> PlannedRun:
+        """Measure this machine, and return and report the plan that fits the budget.
+
+        Raises:
+            InputError: No scene can be used, the budget is too short, or the disk too small.
+        """
+        params = self.params
+        errors.print("measuring this machine with a few scenes ...")
+        speed, sources, held_out = self._measure_speed()
+        data = Data(has_simulated(sources), has_simulated(held_out), _count_recorded(sources),
+                    _count_recorded(held_out), params.batch * get_world_size(),
+                    self.trainer.max_cuts(params))
+        given = Plan(params.data.scans, params.data.val_scans, 0, params.steps,
+                     params.validate_steps, bool(self.trainer.reduced_range(params)))
+        plan = fit_plan(self.request.budget or DEFAULT_BUDGET_H, cores(), speed, data, given,
+                        params.epochs)
+        if params.validate_epochs and not params.validate_steps:
+            epoch = max(1, round((plan.scans + data.recorded) / data.batch))
+            plan = replace(plan, validate_steps=params.validation_steps(epoch))
+        _require_disk_space(Path(params.data.cache), params.data.cache_gb, plan, speed)
+        self._print_plan(plan, speed, data, find_recorded_height(sources))
+        return PlannedRun(settings, plan, speed, data)
+
+    def shorten_plan(self, run: PlannedRun, begun: float, hours: float) -> PlannedRun:
+        """Return the plan with fewer steps if the preparation took longer than planned.
+
+        Other work may slow steps and preparation differently, so steps are measured again.
+
+        Args:
+            run: The plan, of which no step is done yet.
+            begun: time.monotonic() at the start of the run.
+            hours: Time budget, from the start on.
+        """
+        _, plan, speed, data = run
+        passed = time.monotonic() - begun
+        slowdown = max(1.0, (passed - STARTUP_S) / preparation_duration(plan, cores(), speed))
+
+        def seconds_left() -> float:
+            return begun + 3600 * hours - time.monotonic()
+
+        if shorten_plan(plan, seconds_left(), slowdown, speed, data) == plan:
+            return run
+        now = self._measure_speed()[0]
+        step_slowdown = now.step / speed.step if plan.part else now.whole / speed.whole
+        shortened = shorten_plan(plan, seconds_left(), max(1.0, step_slowdown), speed, data)
+        if shortened != plan:
+            errors.print(f"the preparation took {duration(passed)}, {slowdown:.1f} times as long "
+                         f"as planned, and a step takes {step_slowdown:.1f} times as long: "
+                         f"{shortened.steps} steps instead of {plan.steps}")
+        return run._replace(plan=shortened)
+
+    def apply_plan(self, plan: Plan) -> Any:
+        """Return the parameters with the numbers of a plan."""
+        part = self.trainer.reduced_range(self.params) if plan.part else {}
+        return with_values(self.params, {
+            "steps": plan.steps, "validate_steps": plan.validate_steps,
+            "data.scans": plan.scans, "data.val_scans": plan.val_scans, **part})
+
+    def _measure_speed(self) -> tuple[Speed, Sequence[Any], Sequence[Any]]:
+        """Return durations on this machine now, and the scene sources they were measured with."""
+        params = limit_to_few_scans(self.params)
+        sources, held_out = open_scenes(self.request, params, self.sensor)
+        scenes, scan, scan_mb = _time_scans((*sources, *held_out))
+        cut, step, whole, frame = self.trainer.measure_speed(params, scenes, held_out, self.device)
+        return Speed(scan, cut, step, whole, frame, scan_mb), sources, held_out
+
+    def _print_plan(self, plan: Plan, speed: Speed, data: Data, height: float | None) -> None:
+        params = self.params
+        at_height = "" if height is None else f" at {height:g} m"
+        scenes = " and ".join(text for count, text in (
+            (plan.scans, f"{plan.scans} {params.scene} scans of {params.sensor} at "
+                         f"{self.sensor.height:g} m"),
+            (data.recorded, f"{data.recorded} recorded scenes{at_height}")) if count)
+        part = self.trainer.reduced_range(params) if plan.part else {}
+        region = f" up to {part['ahead']:g} m ahead and {part['aside']:g} m aside" if part else ""
+        often = (f"every {plan.validate_steps} steps" if plan.validate_steps < plan.steps
+                 else "at the end")
+        errors.print(f"{self.trainer.name}: {scenes}, {plan.steps} steps of {data.batch} scenes"
+                     f"{region}, validated {often} on "
+                     f"{plan.val_scans + data.val_recorded} other scenes")
+        steps, validations = training_durations(plan, speed, data)
+        cutting = preparation_duration(replace(plan, scans=0, val_scans=0), cores(), speed)
+        parts = {"simulating": preparation_duration(plan, cores(), speed) - cutting,
+                 self.trainer.cutting: cutting, "steps": steps, "validation": validations}
+        errors.print(f"about {duration(sum(parts.values()))} on {cores()} cores as busy as now, "
+                     f"torch with {torch.get_num_threads()} threads: "
+                     + ", ".join(f"{name} {duration(value)}" for name, value in parts.items()))
+        errors.print(f"cache: {params.data.cache}; an interrupted run continues with --resume")
+
+
+def open_scenes(request: TrainingRequest, params: Any, sensor: Sensor) -> tuple[tuple, tuple]:
+    """Return the sources of scenes to train on and to validate on."""
+    around = getattr(params, "range", "") == "around"
+    return open_sources(request.data, request.val, request.split, request.val_split, params.data,
+                        params.seed, sensor, around, params.scene, params.mount_height)
+
+
+def limit_to_few_scans(params: Any) -> Any:
+    """Return the parameters with so few scans that they are quickly simulated, and no cache."""
+    return with_values(params, {"data.scans": 8, "data.val_scans": 1, "data.cache": ""})
+
+
+def has_simulated(sources: Sequence[Any]) -> bool:
+    """Return True if any source simulates its scans."""
+    return any(isinstance(source, SimulatedScenes) for source in sources)
+
+
+def find_recorded_height(sources: Sequence[Any]) -> float | None:
+    """Return the sensor height of the recordings in metres, None without any or if they differ."""
+    heights = [source.sensor_height for source in sources if isinstance(source, RecordedScenes)]
+    if not heights or max(heights) - min(heights) >= HEIGHT_APART:
+        return None
+    return round(median(heights), 2)
+
+
+def _count_recorded(sources: Sequence[Any]) -> int:
+    return sum(len(source) for source in sources if not isinstance(source, SimulatedScenes))
+
+
+def _time_scans(sources: Sequence[Any]) -> tuple[Iterable[Item], float, float]:
+    """Return a few scenes, and the duration (s) and size (MB) of a simulated scan.
+
+    The duration includes the scan's share of making its scene. Without simulated scans both are 0
+    and the recorded scenes are read on demand. The sources have no cache.
+    """
+    for source in sources:
+        if isinstance(source, SimulatedScenes):
+            count = source.per_scene
+            source.scene(0)  # compiles the simulator
+            begun = time.perf_counter()
+            scenes = [source.scene(i)
+                      for i in range(count, count + min(count, MAX_TIMED_SCENES))]
+            return ([Item(scene) for scene in scenes],
+                    (time.perf_counter() - begun) / len(scenes), scenes[0].points.nbytes * 1.02e-6)
+    recorded = SceneReader(tuple(sources), lambda source, i: source.scene(i))
+    return (recorded[n] for n in range(len(recorded))), 0.0, 0.0
+
+
+def _require_disk_space(cache: Path, max_gb: float, plan: Plan, speed: Speed) -> None:
+    needed = min((plan.scans + plan.val_scans) * speed.scan_mb / 1e3, max_gb)
+    free = shutil.disk_usage(cache).free / 1e9
+    if needed + MIN_FREE_GB > free:
+        raise InputError(f"{cache} needs {needed:.1f} GB for scans, and {free:.1f} GB are free: "
+                         "give fewer --data-scans, a smaller --data-cache-gb or another --out")

@@ -1,0 +1,137 @@
+"""Trainer of the PointNet: its speed, and the clusters of all scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lidar_perception.detectors.checkpoint import POINTPILLARS, network_of
+from lidar_perception.detectors.pointnet.config import PointNetConfig
+from lidar_perception.detectors.pointnet.network import make_pointnet
+from lidar_perception.detectors.pointnet.params import PointNetParams
+from lidar_perception.detectors.pointnet.weights_file import weights_file
+from lidar_perception.detectors.pointpillars.params import PointPillarsParams
+from lidar_perception.detectors.pointpillars.weights_file import weights_file as pointpillars_file
+from lidar_perception.detectors.weights_file import existing
+from lidar_perception.training.augment import TrainingScene
+from lidar_perception.training.data import Batches, Item, SceneReader, Stream
+from lidar_perception.training.params import PointNetTraining
+from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes, cut_clusters
+from lidar_perception.training.pointnet.task import (
+    ClusterPreparation,
+    load_validation_clusters,
+    make_loss,
+    make_task,
+    validate_network,
+)
+from lidar_perception.training.request import PACKAGE
+from lidar_perception.training.run import Task
+from lidar_perception.training.timing import (
+    find_readable_frame,
+    measure_duration,
+    measure_step,
+    select_usable_scenes,
+)
+from lidar_perception.training.trainer import Cuts, StepSpeed
+from lidar_perception.types import InputError
+
+TIMED_FRAMES = 8  # validated together, so that the calibration counts little
+
+
+def find_proposer(params: PointNetTraining) -> Path | None:
+    """Return the file that params.proposer names, None without one.
+
+    Raises:
+        InputError: The file is missing, or is no PointPillars.
+    """
+    if params.proposer in ("", str(PACKAGE)):
+        return pointpillars_file(PointPillarsParams()) if params.proposer else None
+    path = existing(params.proposer, "proposer")
+    if network_of(path) != POINTPILLARS:
+        raise InputError(f"{path} is no PointPillars, whose weights `proposer` names")
+    return path
+
+
+@dataclass(frozen=True)
+class PointNetTrainer:
+    """Trainer of a PointNet of a configuration; the methods are described in Trainer."""
+
+    config: PointNetConfig
+    cutting: str = "cutting clusters"
+
+    @property
+    def name(self) -> str:
+        """Name of the network in messages."""
+        return f"PointNet {self.config.title}".strip()
+
+    def packaged_weights(self, params: PointNetTraining) -> Path:
+        """Return the weights of the improved network, which fit the others in part."""
+        return weights_file(PointNetParams())
+
+    def max_cuts(self, params: PointNetTraining) -> int:
+        """Return a number beyond every data set, as all scenes are cut."""
+        return 10**9
+
+    def reduced_range(self, params: PointNetTraining) -> dict[str, Any]:
+        """Return nothing: clusters are used at any range."""
+        return {}
+
+    def measure_speed(self, params: PointNetTraining, scenes: Iterable[Item],
+                      held_out: Sequence[Any], device: torch.device) -> StepSpeed:
+        """Measure durations with clusters of the first usable scenes."""
+        prepare = ClusterPreparation(self.config, params.augment)
+        make_rng, proposer = partial(np.random.default_rng, 0), find_proposer(params)
+
+        def cut_scene(scene: TrainingScene) -> CutScene:
+            return cut_clusters(scene, self.config, params.data.min_points, proposer)
+
+        def prepare_scene(scene: TrainingScene) -> Any:
+            return prepare(cut_scene(scene), make_rng())
+
+        chosen = select_usable_scenes(scenes, prepare_scene)  # compiles, too
+        cutting, parts = measure_duration(lambda: [cut_scene(scene) for scene in chosen])
+        network = make_pointnet(self.config).to(device)
+        step = measure_step(network, make_loss(self.config, device),
+                            lambda: [prepare(part, make_rng()) for part in parts], params, device)
+        frame = find_readable_frame(SceneReader(tuple(
+            CutScenes(source, self.config, params.data.min_points) for source in held_out),
+            load_validation_clusters), lambda frame: len(frame.clusters) > 0)
+        network.eval()
+        with torch.no_grad():
+            validate_network(network, [frame])
+            validation, _ = measure_duration(
+                lambda: validate_network(network, [frame] * TIMED_FRAMES))
+        return StepSpeed(cutting / len(chosen), step, step, validation / TIMED_FRAMES)
+
+    def make_cuts(self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any],
+                  cache: Path) -> Cuts:
+        """Return the clusters of all scenes."""
+        cut = partial(CutScenes, config=self.config, min_points=params.data.min_points,
+                      cache=cache / "clusters", proposer=find_proposer(params))
+        cuts = [*(cut(source, sparse=params.augment.sparse) for source in sources),
+                *map(cut, held_out)]
+        return Cuts(cuts, [range(len(source)) for source in cuts])
+
+    def collect_cuts(self, params: PointNetTraining, cuts: Cuts, out: Path) -> None:
+        """Do nothing: training reads the cache."""
+
+    def make_streams(self, params: PointNetTraining, sources: Sequence[Any],
+                     held_out: Sequence[Any], cuts: Cuts,
+                     out: Path) -> tuple[Stream, SceneReader]:
+        """Return the clusters to train on and to validate on."""
+        training, validation = cuts.sources[:len(sources)], cuts.sources[len(sources):]
+        prepare = ClusterPreparation(self.config, params.augment, bool(params.proposer))
+        return (Stream(tuple(training), prepare, params.seed),
+                SceneReader(tuple(validation), load_validation_clusters))
+
+    def make_task(self, params: PointNetTraining, batches: Batches, held_out: SceneReader,
+                  out: Path, device: torch.device, about: dict[str, Any], commit: str,
+                  init: Path | None) -> Task:
+        """Return the task of the training loop."""
+        return make_task(self.config, params, batches, held_out, out, device, about, commit, init)

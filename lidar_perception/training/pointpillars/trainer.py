@@ -1,0 +1,148 @@
+"""Trainer of PointPillars: its speed, and the objects that are pasted into scenes."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.pointpillars.config import NetworkConfig
+from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
+from lidar_perception.detectors.pointpillars.network import channels_last, make_network
+from lidar_perception.detectors.pointpillars.params import PointPillarsParams
+from lidar_perception.detectors.pointpillars.weights_file import weights_file
+from lidar_perception.training.cut_objects import CutObjects, cut_objects, join_databases
+from lidar_perception.training.data import Batches, Item, SceneReader, Stream
+from lidar_perception.training.database import Database
+from lidar_perception.training.params import PointPillarsTraining
+from lidar_perception.training.pointpillars.task import (
+    VALIDATION_PARAMS,
+    ScenePreparation,
+    detect_in_frame,
+    load_validation_frame,
+    make_loss,
+    make_task,
+    reduce_range,
+)
+from lidar_perception.training.run import Task
+from lidar_perception.training.timing import (
+    find_readable_frame,
+    measure_duration,
+    measure_step,
+    select_usable_scenes,
+)
+from lidar_perception.training.trainer import Cuts, StepSpeed
+from lidar_perception.types import InputError
+
+OBJECTS = "objects.npz"
+# Range ahead and aside in metres that contains most objects.
+REDUCED_RANGES = {"ahead": (46.08, 23.04), "around": (30.72, 30.72)}
+
+
+@dataclass(frozen=True)
+class PointPillarsTrainer:
+    """Trainer of a PointPillars of a configuration; the methods are described in Trainer."""
+
+    config: NetworkConfig
+    cutting: str = "cutting objects"
+
+    @property
+    def name(self) -> str:
+        """Name of the network in messages."""
+        return f"PointPillars {self.config.title}"
+
+    def packaged_weights(self, params: PointPillarsTraining) -> Path:
+        """Return the weights of the same version and size."""
+        return weights_file(PointPillarsParams(version=params.version, size=params.size))
+
+    def max_cuts(self, params: PointPillarsTraining) -> int:
+        """Return the number of scenes that objects are cut from; 0 if none are pasted."""
+        augment = params.augment
+        pasted = augment.crowded and (augment.cars or augment.pedestrians or augment.cyclists
+                                      or augment.things)
+        return augment.database_scans if pasted else 0
+
+    def reduced_range(self, params: PointPillarsTraining) -> dict[str, Any]:
+        """Return the range that contains most objects; nothing if the user gives a range."""
+        ahead, aside = REDUCED_RANGES[params.range]
+        return {} if params.ahead or params.aside else {"ahead": ahead, "aside": aside}
+
+    def measure_speed(self, params: PointPillarsTraining, scenes: Iterable[Item],
+                      held_out: Sequence[Any], device: torch.device) -> StepSpeed:
+        """Measure durations, with objects pasted from the scenes themselves."""
+        def cut_all() -> list[Database]:
+            return [cut_objects(scene, self.config.classes, params.data.min_points)
+                    for scene in chosen]
+
+        reduced = reduce_range(self.config, **(self.reduced_range(params) or {
+            "ahead": params.ahead, "aside": params.aside}))
+        prepare = ScenePreparation(reduced, params.augment, params.data.min_points)
+        chosen = select_usable_scenes(scenes, lambda scene: prepare(
+            scene, np.random.default_rng(0)))
+        cut_objects(chosen[0], self.config.classes, params.data.min_points)  # compiles
+        cutting, parts = measure_duration(cut_all)
+        network = make_network(self.config).to(device)
+        channels_last(network)
+        with tempfile.TemporaryDirectory() as folder:
+            join_databases(parts).save(Path(folder) / OBJECTS)
+            prepare_pasted = replace(
+                prepare, database=Path(folder) / OBJECTS if self.max_cuts(params) else None)
+            step = measure_step(network, make_loss(reduced, device), lambda: [
+                prepare_pasted(scene, np.random.default_rng(0)) for scene in chosen],
+                params, device)
+        detector = PointPillarsDetector(TorchNetwork(network, device), Header(self.config), device,
+                                        VALIDATION_PARAMS)
+        frame = find_readable_frame(self._make_reader(held_out), lambda frame: detect_in_frame(
+            frame, detector).problem is None)
+        whole = step * np.prod(self.config.grid) / np.prod(reduced.grid)
+        validation, _ = measure_duration(lambda: detect_in_frame(frame, detector))
+        return StepSpeed(cutting / len(chosen), step, float(whole), validation)
+
+    def make_cuts(self, params: PointPillarsTraining, sources: Sequence[Any],
+                  held_out: Sequence[Any], cache: Path) -> Cuts:
+        """Return the objects of some scenes, which the seed draws."""
+        ends = np.cumsum([0, *map(len, sources)])
+        chosen = np.random.default_rng(params.seed).permutation(ends[-1])[:self.max_cuts(params)]
+        cuts = [CutObjects(source, self.config.classes, params.data.min_points, cache / "objects")
+                for source in sources]
+        return Cuts(cuts, [np.sort(chosen[(chosen >= first) & (chosen < end)] - first).tolist()
+                           for first, end in pairwise(ends)])
+
+    def collect_cuts(self, params: PointPillarsTraining, cuts: Cuts, out: Path) -> None:
+        """Write all cut objects into OBJECTS."""
+        if not self.max_cuts(params) or (out / OBJECTS).is_file():
+            return
+        parts = []
+        for source, numbers in zip(*cuts):
+            for i in numbers:
+                try:
+                    parts.append(source.scene(i))
+                except InputError:  # reported when training reads it
+                    continue
+        join_databases(parts).save(out / OBJECTS)
+
+    def make_streams(self, params: PointPillarsTraining, sources: Sequence[Any],
+                     held_out: Sequence[Any], cuts: Cuts,
+                     out: Path) -> tuple[Stream, SceneReader]:
+        """Return the scenes to train on and to validate on."""
+        prepare = ScenePreparation(
+            reduce_range(self.config, params.ahead, params.aside), params.augment,
+            params.data.min_points, out / OBJECTS if self.max_cuts(params) else None)
+        return Stream(tuple(sources), prepare, params.seed), self._make_reader(held_out)
+
+    def make_task(self, params: PointPillarsTraining, batches: Batches, held_out: SceneReader,
+                  out: Path, device: torch.device, about: dict[str, Any], commit: str,
+                  init: Path | None) -> Task:
+        """Return the task of the training loop."""
+        return make_task(self.config, params, batches, held_out, out, device, about, commit, init)
+
+    def _make_reader(self, held_out: Sequence[Any]) -> SceneReader:
+        return SceneReader(tuple(held_out), partial(load_validation_frame, self.config))

@@ -1,0 +1,117 @@
+"""The folder of a training run: its files, its plan, and its lock."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lidar_perception.runs.files import check_folder, read_text, remove_temporaries, write_text
+from lidar_perception.runs.resuming import differences, locked
+from lidar_perception.runs.stopping import terminated_as_interrupted
+from lidar_perception.training.distributed import get_rank
+from lidar_perception.training.plan import Data, Plan, Speed
+from lidar_perception.types import InputError
+
+RUN = "run.json"   # settings, measured speed and plan of the first start
+STATE = "last.pt"  # what a resumed run needs
+WEIGHTS = "best.safetensors", "last.safetensors"
+SCANS = "scans"    # the cache, unless another one is given
+WRITTEN = (RUN, STATE, *WEIGHTS, "objects.npz", "log.csv", "validation.csv")
+MAX_RUN_BYTES = 10**6
+
+
+class PlannedRun(NamedTuple):
+    """Content of RUN. settings: everything that a resumed run must have in common."""
+
+    settings: dict[str, Any]
+    plan: Plan
+    speed: Speed
+    data: Data
+
+
+@dataclass(frozen=True)
+class RunDirectory:
+    """The folder of a training run."""
+
+    path: Path
+
+    @property
+    def state_file(self) -> Path:
+        """Path of the state from which a run resumes."""
+        return self.path / STATE
+
+    @property
+    def plan_file(self) -> Path:
+        """Path of the plan."""
+        return self.path / RUN
+
+    def require_no_run(self, resume: bool) -> None:
+        """Check that a run may begin here.
+
+        Raises:
+            InputError: The folder holds a run and resume is False, has weights that belong to no
+                run and would be replaced, or cannot be written.
+        """
+        files = self.plan_file, self.state_file
+        for file in files:
+            self._require_absent(file, resume)
+        for name in WEIGHTS:
+            if not any(file.exists() for file in files) and (self.path / name).exists():
+                raise InputError(f"{self.path / name} belongs to no run that could be resumed, and "
+                                 "would be replaced; give another --out")
+
+    def require_no_state(self, resume: bool) -> None:
+        """Raise InputError as require_no_run does, for the state alone."""
+        self._require_absent(self.state_file, resume)
+
+    def _require_absent(self, file: Path, resume: bool) -> None:
+        check_folder(self.path)
+        if file.exists() and not resume:
+            raise InputError(f"{self.path} holds a training run already; give --resume to resume "
+                             "it, or another --out")
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep other processes from writing into the folder, and end at SIGTERM as at Ctrl-C.
+
+        Removes temporary files that a killed run left. Of processes that train together only
+        rank 0 does this.
+        """
+        if get_rank() > 0:
+            yield
+            return
+        with locked(self.path), terminated_as_interrupted():
+            remove_temporaries(self.path, *WRITTEN)
+            for folder in (self.path / SCANS, *(self.path / SCANS).glob("*/")):
+                remove_temporaries(folder, "*.npz")
+            yield
+
+    def write_plan(self, run: PlannedRun) -> None:
+        """Write the plan file."""
+        write_text(self.plan_file, json.dumps({
+            "asked": run.settings, "plan": asdict(run.plan), "speed": asdict(run.speed),
+            "data": asdict(run.data)}, indent=1))
+
+    def read_plan(self, settings: dict[str, Any]) -> PlannedRun:
+        """Read the plan file.
+
+        Raises:
+            InputError: The file cannot be read, or was made with other settings.
+        """
+        text = read_text(self.plan_file, MAX_RUN_BYTES)
+        try:
+            content = json.loads(text)
+            run = PlannedRun(content["asked"], Plan(**content["plan"]), Speed(**content["speed"]),
+                             Data(**content["data"]))
+            different = differences(run.settings, json.loads(json.dumps(settings)))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(f"cannot read {self.plan_file}: {error!r}; give another --out"
+                             ) from None
+        if different:
+            raise InputError(f"{self.path} holds a run with {'; '.join(different[:3])}; resume it "
+                             "with the same settings, or give another --out")
+        return run

@@ -1,0 +1,102 @@
+"""Measured durations of the parts of a training run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
+from typing import Any, TypeVar
+
+import torch
+from torch import nn
+
+from lidar_perception.detectors.devices import number_format
+from lidar_perception.runs.machine import cores
+from lidar_perception.training.data import Item, SceneReader
+from lidar_perception.training.params import LoopParams
+from lidar_perception.types import InputError
+
+MAX_TIMED_SCENES = 4
+
+Result = TypeVar("Result")
+
+
+def measure_duration(work: Callable[[], Result]) -> tuple[float, Result]:
+    """Return how long work() takes, in seconds, and its result."""
+    begun = time.perf_counter()
+    result = work()
+    return time.perf_counter() - begun, result
+
+
+def select_usable_scenes(scenes: Iterable[Item], prepare: Callable[[Any], Any]) -> list[Any]:
+    """Return the first scenes, at most MAX_TIMED_SCENES, that prepare(scene) accepts.
+
+    Raises:
+        InputError: No scene can be used; the message gives the first reason.
+    """
+    chosen: list[Any] = []
+    reasons: list[str] = []
+    for scene, skipped in scenes:
+        reasons += skipped
+        if scene is None:
+            continue
+        try:
+            prepare(scene)
+        except InputError as error:
+            reasons.append(str(error))
+            continue
+        chosen.append(scene)
+        if len(chosen) == MAX_TIMED_SCENES:
+            break
+    if not chosen:
+        raise InputError("no scene to train on can be used "
+                         f"({next(iter(reasons), 'there is none')})")
+    return chosen
+
+
+def find_readable_frame(scenes: SceneReader,
+                        is_typical: Callable[[Any], bool] = lambda _: True) -> Any:
+    """Return the first validation frame that can be read and is typical, else the first readable.
+
+    Raises:
+        InputError: No frame can be read; the message gives the first reason.
+    """
+    fallback: Any = None
+    reasons: list[str] = []
+    for n in range(len(scenes)):
+        sample, skipped = scenes[n]
+        reasons += skipped
+        if sample is not None and is_typical(sample):
+            return sample
+        fallback = sample if fallback is None else fallback
+    if fallback is None:
+        raise InputError("no frame to validate on can be used "
+                         f"({next(iter(reasons), 'there is none')})")
+    return fallback
+
+
+def measure_step(module: nn.Module, loss: Callable, prepare: Callable[[], Sequence[Any]],
+                 params: LoopParams, device: torch.device) -> float:
+    """Return the duration of one training step in seconds, with its share of sample preparation.
+
+    Args:
+        module: Network to train; its gradients and statistics change.
+        loss: loss(module, batch), as in run.Task.
+        prepare: Returns a few samples. Training runs it in other processes.
+    """
+    prepare()  # compiles kernels
+    preparation, samples = measure_duration(prepare)
+    batch = [samples[i % len(samples)] for i in range(params.batch)]
+    amp = number_format(params.amp, device)
+
+    def step() -> None:  # in this process only, even if several train together
+        with torch.autocast(device.type, amp) if amp else nullcontext():
+            total, _ = loss(module, batch)
+        total.backward()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+
+    module.train()
+    step()
+    duration, _ = measure_duration(step)
+    return duration + preparation / len(samples) * params.batch / cores()
