@@ -71,12 +71,13 @@ def layers_format() -> Any:
                  choices=("off", "auto", "bf16"), fixed=True)
 
 
-def network_engine() -> Any:
-    """Return the parameter of detectors with PointPillars that chooses what runs its layers."""
+def network_engine(more: str = "") -> Any:
+    """Return the parameter of detectors with PointPillars that chooses what runs its layers; more:
+    a sentence on the detector's other network."""
     return param("auto", "What runs PointPillars' layers on the CPU. sparse: kernels that compute "
                  "only the cells near points, for versions without ground (v1, v2, v4), x86-64 "
                  "with AVX2 and amp off. torch: all cells. auto: sparse where it can. Detections "
-                 "are the same.", choices=("auto", "torch", "sparse"), fixed=True)
+                 "are the same." + more, choices=("auto", "torch", "sparse"), fixed=True)
 
 
 def share_on_points() -> Any:

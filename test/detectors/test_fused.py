@@ -32,7 +32,7 @@ from lidar_perception.detectors.fused.evidence import LEAST, clipped_logit
 from lidar_perception.detectors.fused.fusion import KNOTS, package_models
 from lidar_perception.detectors.fused.model import probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
-from lidar_perception.detectors.pointnet import rescoring
+from lidar_perception.detectors.pointnet import detector as pointnet_detector
 from lidar_perception.detectors.view import without_carrier
 from lidar_perception.geometry import bev_iou, points_in_box, points_in_boxes, wrap_angle
 from lidar_perception.ground.surface import MIN_POINTS, fit_ground_heights
@@ -278,7 +278,7 @@ def test_no_part_leaves_its_device_where_it_may_not(detector, monkeypatch):
     """What the node is told holds for both networks."""
     def predict(*_, **__):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
-    monkeypatch.setattr(rescoring, "predict", predict)
+    monkeypatch.setattr(pointnet_detector, "predict", predict)
     other = copy.copy(detector)
     other.classifier = copy.copy(detector.classifier)
     other.classifier.place = Place(torch.device("meta"))

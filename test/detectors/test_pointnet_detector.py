@@ -213,7 +213,8 @@ def test_what_is_not_a_number_is_left_out_and_said(layer, ids):
     assert same(found, expected)
     assert f"1 of {ids.max()} clusters" in found.problem and "NaN" in found.problem
     getattr(detector.network, layer).bias.fill_(np.nan)
-    found = detector(scan, cluster_ids=ids)
+    broken = PointNetDetector(detector.network, detector.header, CPU, detector.params)
+    found = broken(scan, cluster_ids=ids)
     assert len(found.detections) == 0 and "NaN" in found.problem
 
 
@@ -247,10 +248,10 @@ def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(ids, monkey
     scan, expected, real = frame(), random_detector()(frame(), cluster_ids=ids), module.predict
     broken = random_detector()
 
-    def predict(network, clusters):
+    def predict(network, clusters, **labels):
         if broken.device != CPU:
             raise torch.cuda.OutOfMemoryError("CUDA out of memory")
-        return real(network, clusters)
+        return real(network, clusters, **labels)
     monkeypatch.setattr(module, "predict", predict)
     broken.place.device = torch.device("meta")
     for _ in range(2):

@@ -16,6 +16,7 @@ from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.parallel import in_parts
 from lidar_perception.detectors.pointpillars import sparse
 from lidar_perception.detectors.pointpillars.config import network_config
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
@@ -158,7 +159,7 @@ def test_an_error_in_one_part_is_raised(monkeypatch):
 
     torch.set_num_threads(2)
     with pytest.raises(ZeroDivisionError):
-        sparse._in_parts(fail, 100, sparse.MIN_PER_PART)
+        in_parts(fail, 100, 4)
 
 
 @pytest.mark.parametrize("layer", ["pillar_net.linear.weight", "blocks.1.0.0.weight",

@@ -207,7 +207,8 @@ def load_fused_detector(path: str | Path = "", device: str = "auto",
                                         threads=settings.threads, engine=settings.engine,
                                         cpu_fallback=settings.cpu_fallback)))
     classifier = load_pointnet_detector(fusion.classifier, device, PointNetDetectorParams(
-        pointnet=PointNetParams(warm_up=False, cpu_fallback=settings.cpu_fallback)))
+        pointnet=PointNetParams(warm_up=False, cpu_fallback=settings.cpu_fallback,
+                                engine="torch" if settings.engine == "torch" else "auto")))
     detector = FusedDetector(proposer, classifier, params, fusion.models)
     detector.doubt = "; ".join(fusion.doubts(detector.classes)) or None
     if settings.warm_up:

@@ -35,7 +35,8 @@ class FusedParams(NetworkParams):
                             "the package.", fixed=True)
     range: str = seen_range()
     amp: str = layers_format()
-    engine: str = network_engine()
+    engine: str = network_engine(" torch also runs the cluster network in torch, which otherwise "
+                                 "runs in compiled kernels.")
     proposals: float = param(0.02, "Least score of PointPillars for a box to be looked at.",
                              low=0.001, high=1.0)
     max_proposals: int = param(200, "Boxes of PointPillars that are looked at, those with its "

@@ -16,8 +16,10 @@ from lidar_perception.detectors.calibration import calibrated
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.devices import CPU, chosen_device
+from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.nms import suppressed
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
+from lidar_perception.detectors.pointnet.compiled import CompiledPointNet
 from lidar_perception.detectors.pointnet.network import PointNet, fused, load_pointnet
 from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams, PointNetParams
 from lidar_perception.detectors.pointnet.predict import Predictions, found, predict
@@ -41,7 +43,10 @@ class PointNetDetector(NetworkDetector):
     def __init__(self, network: PointNet, header: Header, device: torch.device = CPU,
                  params: PointNetDetectorParams = PointNetDetectorParams()):
         super().__init__(header, device, params)
-        self.network = fused(network).to(device)
+        self.network = fused(network)
+        self.compiled = (CompiledPointNet(self.network)
+                         if LANES and params.pointnet.engine == "auto" else None)
+        self.network.to(device)
 
     @property
     def settings(self) -> PointNetParams:
@@ -68,7 +73,7 @@ class PointNetDetector(NetworkDetector):
         left_out = max(len(clusters) - most, 0)
         clusters = clusters.nearest(most).on(seen.xyz.compress(ground, axis=0))
         t4 = self.now()
-        predicted = self.guarded(lambda: predict(self.network, clusters))
+        predicted = self.predict(clusters)
         t5 = self.now()
         detections, best, broken = self._detections(predicted)
         boxes = cars_on_points(detections.boxes, detections.class_ids,
@@ -79,6 +84,14 @@ class PointNetDetector(NetworkDetector):
             STEPS, (t1 - t0 + t4 - t3, t2 - t1, t3 - t2, t5 - t4, t6 - t5))}
         problem = broken or self._problem(frame, cluster_ids, clusters, left_out) or self.fallback
         return Found(detections, ms, problem, best)
+
+    def predict(self, clusters: Clusters, labels: np.ndarray | None = None) -> Predictions:
+        """Return predict.predict() of the network where it runs now."""
+        def run() -> Predictions:
+            compiled = self.compiled if self.device == CPU else None
+            return predict(compiled or self.network, clusters, labels=labels)
+
+        return self.guarded(run)
 
     def _detections(self, predicted: Predictions) -> tuple:
         """Detections, and what nothing_passed gives."""

@@ -24,6 +24,9 @@ class PointNetParams(NetworkParams):
                               "some hundred. The diagnostics say how many are left out.", low=1,
                               high=1_000_000)
     on_points: float = share_on_points()
+    engine: str = param("auto", "What runs the network on the CPU. torch: torch. auto: compiled "
+                        "kernels on x86-64 with AVX2, otherwise torch. Detections are the same.",
+                        choices=("auto", "torch"), fixed=True)
 
 
 INPUT = InputParams()

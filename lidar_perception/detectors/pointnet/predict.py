@@ -12,6 +12,7 @@ from lidar_perception.detectors.nms import best_of_each
 from lidar_perception.detectors.params import NmsParams
 from lidar_perception.detectors.pointnet.box_head import decode
 from lidar_perception.detectors.pointnet.clusters import ClusterInput, Clusters, network_input
+from lidar_perception.detectors.pointnet.compiled import CompiledPointNet
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import Outputs, PointNet
 from lidar_perception.types import Detections
@@ -50,8 +51,8 @@ def found(predictions: Predictions, config: PointNetConfig, least: Sequence[floa
 
 
 @torch.inference_mode()
-def predict(network: PointNet, clusters: Clusters, seed: int = 0, chunk: int = CHUNK,
-            labels: np.ndarray | None = None) -> Predictions:
+def predict(network: PointNet | CompiledPointNet, clusters: Clusters, seed: int = 0,
+            chunk: int = CHUNK, labels: np.ndarray | None = None) -> Predictions:
     """What the network, in eval mode, makes of each of K clusters, K may be 0; labels (K,): the
     classes that are asked about, instead of the likeliest."""
     config, classes = network.config, len(network.config.classes)
@@ -59,7 +60,10 @@ def predict(network: PointNet, clusters: Clusters, seed: int = 0, chunk: int = C
         return Predictions(np.zeros((0, classes + 1), np.float32), np.zeros(0, np.int64),
                            np.zeros((0, 7), np.float32))
     inputs = network_input(clusters, config.points, seed)
-    outputs = outputs_of(network, inputs, chunk)
+    if isinstance(network, CompiledPointNet):
+        outputs, network = network(inputs), network.network
+    else:
+        outputs = outputs_of(network, inputs, chunk)
     probabilities = network.probabilities(outputs.logits).cpu().numpy()
     if labels is None:
         labels = probabilities[:, :classes].argmax(axis=1)

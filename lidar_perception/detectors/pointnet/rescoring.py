@@ -6,7 +6,6 @@ import numpy as np
 
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
-from lidar_perception.detectors.pointnet.predict import predict
 from lidar_perception.types import CLASSES, Detections
 
 
@@ -30,5 +29,5 @@ def class_probabilities(classifier: PointNetDetector, detections: Detections, cl
     """
     names = [CLASSES[i] for i in detections.class_ids]
     labels = np.array([*map(classifier.config.classes.index, names)], np.int64)
-    seen = classifier.guarded(lambda: predict(classifier.network, clusters, labels=labels))
+    seen = classifier.predict(clusters, labels)
     return seen.scores.astype(np.float32), seen.boxes.astype(np.float32)

@@ -10,10 +10,7 @@ within rounding.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from itertools import pairwise
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +18,7 @@ import torch
 from torch import Tensor
 
 from lidar_perception.detectors.matrix_kernel import LANES, padded, padded_bias
+from lidar_perception.detectors.parallel import in_parts
 from lidar_perception.detectors.pointpillars import sparse_kernels as kernels
 from lidar_perception.detectors.pointpillars.network import FpnNeck, PointPillars, Prediction
 from lidar_perception.detectors.pointpillars.pillars import Pillars
@@ -34,7 +32,6 @@ from lidar_perception.detectors.pointpillars.sparse_layers import (
 
 REACH = 6                 # cells of the head around each point in which it is evaluated
 MIN_PER_PART = 1_000_000  # multiplications that are worth handing to another thread
-PARTS_PER_THREAD = 4      # so that a thread that is held up leaves its work to the others
 
 
 class Map(NamedTuple):
@@ -223,7 +220,8 @@ def _computed(layer: Layer, maps: list[Map], chosen: np.ndarray, background: Map
                              np.float32(floor), begin, end)
             bias = bias[:0]
 
-    _in_parts(compute, len(cells), sum(weights.size for weights in layer.weights))
+    cost = len(cells) * sum(weights.size for weights in layer.weights)
+    in_parts(compute, len(cells), cost // MIN_PER_PART)
     return Map(index, rows)
 
 
@@ -245,30 +243,3 @@ def _along(size: int, small: int, margin: int) -> tuple[np.ndarray, np.ndarray]:
     kept = np.r_[:margin + 1, small - margin:small]
     cell = np.arange(size)
     return kept, np.where(cell < size - margin, np.minimum(cell, margin), cell - size + len(kept))
-
-
-def _in_parts(compute: Callable[[int, int], None], count: int, cost: int) -> None:
-    """Call compute(begin, end) for parts of 0 .. count on as many threads as torch uses; cost:
-    multiplications of each of `count`."""
-    threads = torch.get_num_threads()
-    parts = min(count * cost // MIN_PER_PART, threads * PARTS_PER_THREAD)
-    if threads == 1 or parts < 2:
-        compute(0, count)
-        return
-    ends = [count * i // parts for i in range(parts + 1)]
-    waiting = iter(list(pairwise(ends)))
-
-    def work() -> None:
-        for begin, end in waiting:
-            compute(begin, end)
-
-    helpers = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
-    work()
-    for helper in helpers:
-        if not helper.cancel():  # it has begun
-            helper.result()
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, "sparse_network")

@@ -107,5 +107,5 @@ def pillar_rows(points, offsets, cells, index, weights, bias, rows):
                 values[k] += value * weights[j, k]
         row = index[1 + cells[i] // width, 1 + cells[i] % width]
         for k in range(len(values)):
-            if not values[k] <= rows[row, k]:  # NaN stays
+            if values[k] > rows[row, k] or values[k] != values[k]:  # NaN stays
                 rows[row, k] = values[k]

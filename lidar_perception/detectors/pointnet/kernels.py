@@ -1,0 +1,144 @@
+"""Compiled kernels of the cluster network: layers, groups of points, and maxima.
+
+Rows of several clusters or groups follow each other: those of number k are first[k] to first[k + 1]
+of first (K + 1,) int64.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from lidar_perception.detectors.matrix_kernel import BLOCK, ROWS, UNROLL, multiply_tile
+
+
+@njit(cache=True, nogil=True)
+def multiply(rows, weights, bias, floor):
+    """Return (R, C) float32: rows (R, B) times weights, plus bias (C,), and not below floor.
+
+    weights: as `packed` returns them, (blocks, 1, channels, BLOCK); B is at least `channels`, and C
+    is blocks x BLOCK.
+    """
+    blocks, _, channels, _ = weights.shape
+    sums = np.empty((len(rows), blocks * BLOCK), np.float32)
+    inputs, starts, outputs = np.empty(ROWS, np.int64), np.empty(ROWS, np.int64), np.empty(
+        ROWS, np.int64)
+    for block in range(blocks):
+        starts[:] = bias.ctypes.data + 4 * BLOCK * block
+        for first in range(0, len(rows), ROWS):
+            for i in range(ROWS):
+                row = min(first + i, len(rows) - 1)  # the last is repeated
+                inputs[i] = rows.ctypes.data + 4 * row * rows.shape[1]
+                outputs[i] = sums.ctypes.data + 4 * (row * sums.shape[1] + BLOCK * block)
+            multiply_tile(inputs.ctypes.data, 1, channels,
+                          weights.ctypes.data + 4 * block * channels * BLOCK, starts.ctypes.data,
+                          outputs.ctypes.data, floor)
+    return sums
+
+
+@njit(cache=True, nogil=True)
+def maxima(rows, first, columns):
+    """Return (K, columns) float32, the greatest of the first columns of each group of rows; NaN
+    where a value is NaN or a group is empty."""
+    greatest = np.full((len(first) - 1, columns), np.nan, np.float32)
+    for k in range(len(greatest)):
+        if first[k] < first[k + 1]:
+            greatest[k] = rows[first[k], :columns]
+        for i in range(first[k] + 1, first[k + 1]):
+            for j in range(columns):
+                value, known = rows[i, j], greatest[k, j]
+                greatest[k, j] = value if value > known or value != value else known
+    return greatest
+
+
+@njit(cache=True, nogil=True)
+def _nearest(points, begin, end, centre, count, distances, indices):
+    """Fill distances and indices with the nearest of points begin .. end to point number centre,
+    squared and rising; return how many there are, at most count."""
+    found = 0
+    for i in range(begin, end):
+        x = points[centre, 0] - points[i, 0]
+        y = points[centre, 1] - points[i, 1]
+        z = points[centre, 2] - points[i, 2]
+        squared = x * x + y * y + z * z
+        if found == count and not squared < distances[found - 1]:
+            continue
+        place = min(found, count - 1)
+        while place > 0 and squared < distances[place - 1]:
+            distances[place], indices[place] = distances[place - 1], indices[place - 1]
+            place -= 1
+        distances[place], indices[place] = squared, i
+        found = min(found + 1, count)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def grouped(points, first, most, radii, counts):
+    """Group points (P, 5 or more) around the first `most` points of each cluster.
+
+    Args:
+        radii, counts: (S,) float32 and int64 of each scale, radii rising: only points up to a
+            radius, and at most so many of these, the nearest, are in a group.
+
+    Returns:
+        For each scale, relative points (S, R, 8) float32, x y z in radii and two more numbers,
+        filled up with zeros; first rows of the groups (S, C + 1); the share of counts that was
+        found over the radius (C, S) float32; and the first centre of each cluster (K + 1,).
+    """
+    clusters, scales = len(first) - 1, len(radii)
+    first_centre = np.zeros(clusters + 1, np.int64)
+    for k in range(clusters):
+        first_centre[k + 1] = first_centre[k] + min(most, first[k + 1] - first[k])
+    centres = first_centre[clusters]
+    relative = np.zeros((scales, centres * counts.max(), 2 * UNROLL), np.float32)
+    starts = np.zeros((scales, centres + 1), np.int64)
+    density = np.empty((centres, scales), np.float32)
+    distances, indices = np.empty(counts.max(), np.float32), np.empty(counts.max(), np.int64)
+    for k in range(clusters):
+        for c in range(first_centre[k], first_centre[k + 1]):
+            centre = first[k] + c - first_centre[k]
+            found = _nearest(points, first[k], first[k + 1], centre, counts.max(), distances,
+                             indices)
+            for s in range(scales):
+                row, radius = starts[s, c], radii[s]
+                for i in range(min(found, counts[s])):
+                    if distances[i] <= radius * radius:
+                        near = points[indices[i]]
+                        for axis in range(3):
+                            relative[s, row, axis] = (near[axis] - points[centre, axis]) / radius
+                        relative[s, row, 3], relative[s, row, 4] = near[3], near[4]
+                        row += 1
+                density[c, s] = (row - starts[s, c]) / (counts[s] * radius)
+                starts[s, c + 1] = row
+    return relative, starts, density, first_centre
+
+
+@njit(cache=True, nogil=True)
+def coarse_maxima(points, first, rows, first_row, most, count, radius, weights):
+    """Return (K, C) float32: the greatest of the sums of a layer over coarse groups of a cluster.
+
+    The groups lie around the first `most` centres of a cluster: of its centres, which are its first
+    points, up to count that are nearest and within the radius. rows (R, C): the layer's sums from
+    the features of each centre, first_row (K + 1,); weights (3, C): of its relative position.
+    Negative sums count as 0.
+    """
+    greatest = np.zeros((len(first) - 1, rows.shape[1]), np.float32)
+    distances, indices = np.empty(count, np.float32), np.empty(count, np.int64)
+    for k in range(len(greatest)):
+        size = first_row[k + 1] - first_row[k]
+        if size == 0:
+            greatest[k] = np.nan
+        for centre in range(first[k], first[k] + min(most, size)):
+            found = _nearest(points, first[k], first[k] + size, centre, count, distances, indices)
+            for i in range(found):
+                if distances[i] > radius * radius:
+                    break
+                row = rows[first_row[k] + indices[i] - first[k]]
+                x = (points[indices[i], 0] - points[centre, 0]) / radius
+                y = (points[indices[i], 1] - points[centre, 1]) / radius
+                z = (points[indices[i], 2] - points[centre, 2]) / radius
+                for j in range(rows.shape[1]):
+                    value = row[j] + x * weights[0, j] + y * weights[1, j] + z * weights[2, j]
+                    if value > greatest[k, j] or value != value:
+                        greatest[k, j] = value
+    return greatest

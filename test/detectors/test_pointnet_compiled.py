@@ -1,0 +1,94 @@
+"""The compiled cluster network computes what torch computes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from pointnet_samples import blobs, lively, random_detector, small
+
+from lidar_perception.detectors.matrix_kernel import LANES
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.pointnet import compiled
+from lidar_perception.detectors.pointnet.clusters import network_input
+from lidar_perception.detectors.pointnet.compiled import CompiledPointNet
+from lidar_perception.detectors.pointnet.config import NETWORKS, pointnet_config
+from lidar_perception.detectors.pointnet.network import fused
+from lidar_perception.detectors.pointnet.predict import outputs_of, predict
+
+pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.skipif(
+    not LANES, reason="Numba compiles for a processor without AVX2")]
+
+SIZES = [1, 2, 3, 5, 11, 12, 13, 31, 32, 33, 100, 300, 7]
+TOLERANCE = 1e-4  # of numbers whose sizes are about 1 to 20
+
+
+def assert_equal(config, clusters, seed=0):
+    network = fused(lively(config, seed))
+    inputs = network_input(clusters, config.points)
+    with torch.inference_mode():
+        found, wanted = CompiledPointNet(network)(inputs), outputs_of(network, inputs)
+    for ours, theirs in zip(found, wanted):
+        assert ours.shape == theirs.shape
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=TOLERANCE)
+    assert wanted.logits.std(dim=0).max() > 0.1  # clusters do differ
+
+
+@pytest.mark.parametrize("spread", [0.05, 0.4, 3.0])
+@pytest.mark.parametrize("name", NETWORKS)
+def test_every_network_equals_torch(name, spread):
+    rng = np.random.default_rng(0)
+    assert_equal(small(name), blobs(rng, SIZES, spread))
+
+
+@pytest.mark.parametrize("changes", [
+    dict(), dict(points=200, centroids=40), dict(radii=(0.3,), neighbours=(5,)),
+    dict(point_channels=(20,), group_channels=(7, 9, 33), local_channels=50, global_channels=70,
+         head_channels=(5,), classes=("Car",), sizes=((3.9, 1.6, 1.5),), yaw_bins=5)])
+def test_other_widths_equal_torch(changes):
+    rng = np.random.default_rng(1)
+    assert_equal(pointnet_config(**changes), blobs(rng, SIZES))
+
+
+def test_clusters_do_not_depend_on_those_around_them(monkeypatch):
+    network = CompiledPointNet(fused(lively(small())))
+    clusters = blobs(np.random.default_rng(2), SIZES * 3)
+    whole = predict(network, clusters)
+    chosen = np.array([4, 0, 30, 17])
+    part = predict(network, clusters.take(chosen))
+    np.testing.assert_array_equal(part.probabilities, whole.probabilities[chosen])
+    monkeypatch.setattr(compiled, "CHUNK", 2)
+    torch.set_num_threads(3)
+    again = predict(network, clusters)
+    np.testing.assert_array_equal(again.probabilities, whole.probabilities)
+    np.testing.assert_array_equal(again.boxes, whole.boxes)
+    assert len(predict(network, clusters.take(np.zeros(0, int))).boxes) == 0
+    assert all(len(x) == 0 for x in network(network_input(clusters.take(np.zeros(0, int)), 32)))
+
+
+@pytest.mark.parametrize("name", ["points.0.0.weight", "local.nets.1.0.0.weight",
+                                  "coarse.net.0.0.weight", "fine.0.0.bias"])
+def test_weights_that_are_no_numbers_are_no_answer(name):
+    network = fused(lively(small()))
+    network.get_parameter(name).view(-1)[0] = torch.nan
+    inputs = network_input(blobs(np.random.default_rng(3), SIZES), 32)
+    assert torch.isnan(CompiledPointNet(network)(inputs).logits).all()
+
+
+@pytest.mark.parametrize("weights", ["fused", "pointnet"])
+def test_engine_torch_compiles_nothing(weights):
+    for engine in "auto", "torch":
+        detector = open_detector(weights, "cpu", settings={
+            f"{weights}.warm_up": False, f"{weights}.engine": engine})
+        classifier = detector.classifier if weights == "fused" else detector
+        assert (classifier.compiled is not None) == (engine == "auto")
+
+
+def test_detector_equals_torch():
+    detector = random_detector()
+    clusters = blobs(np.random.default_rng(4), SIZES)
+    found = detector.predict(clusters)
+    detector.compiled = None
+    wanted = detector.predict(clusters)
+    np.testing.assert_allclose(found.probabilities, wanted.probabilities, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found.boxes, wanted.boxes, rtol=0, atol=TOLERANCE)
