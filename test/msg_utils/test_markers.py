@@ -149,7 +149,7 @@ def test_cubes_of_other_nodes_are_read(make, text, score, extra):
     assert same_boxes(got.boxes, [[1, 2, 3, 4, 5, 6, -2.0]])
     assert (got.labels, got.ids.tolist(), got.frame_id, got.stamp_ns) == (["car"], [4], "map", 5)
     assert got.scores.tolist() == [score] and got.extras == [extra]
-    assert CLASSES[to_truth(got).class_ids[0]] == "Misc"
+    assert CLASSES[to_truth(got).class_ids[0]] == "Car"
     assert to_detections(got).scores.tolist() == [score]
 
 
