@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lidar_perception.nodes import NODES
+from lidar_perception.nodes import NODES, load_node_class
 from lidar_perception.nodes.known import node_parameters
 from lidar_perception.nodes.main import help_text
 from lidar_perception.param_fields import parameter_fields
@@ -50,8 +50,7 @@ def test_documented_topics_are_the_nodes_own(generate, name, domain):
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     from lidar_perception.nodes.watch import leave, new_context
     context = new_context(domain)
-    module = importlib.import_module(f"lidar_perception.nodes.{name}")
-    node = getattr(module, NODES[name][0])(context=context)
+    node = load_node_class(name)(context=context)
     node.start()
     listed = {t for t, _ in [*node.get_publisher_names_and_types_by_node(name, "/"),
                              *node.get_subscriber_names_and_types_by_node(name, "/")]}

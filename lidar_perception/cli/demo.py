@@ -118,7 +118,7 @@ def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: i
     drive = _bag(out / "drive", recording, frames, drive_seed)
     played = _as_replayed(drive, recording)
     clouds = len(played)
-    from lidar_perception.nodes.replay import TRACKS, replay
+    from lidar_perception.nodes.replay.graph_replay import TRACKS, replay
     with errors.status("loading compiled code (the first time: compiling, half a minute or more)"):
         own = _params_of(chosen, played)
     content = replay(drive, clouds, out, own, detector=detector, rate=rate, single=single,
@@ -242,7 +242,7 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
                height: float) -> bool:
     """Draw the recorded frame with most hits, with its tracks, where there are any; False if no
     frame has a label."""
-    from lidar_perception.nodes.replay import TRACKS
+    from lidar_perception.nodes.replay.graph_replay import TRACKS
     from lidar_perception.rendering.colors import by_cluster
     from lidar_perception.rendering.files import write_png
     from lidar_perception.rendering.picture import Boxes, Stage, draw_frame

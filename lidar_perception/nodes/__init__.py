@@ -1,26 +1,36 @@
 """rclpy nodes: convert, call the core, publish. The only part of the package that needs ROS."""
 
+import importlib
+from typing import Any
+
 _BOXES, _DETECTIONS = "params.BoxNodeParams", "params.DetectionNodeParams"
-# Executable -> its class, in the module of the executable's name, and its parameters. scripts/nodes
-# has a link of each name.
+# Executable -> its class (relative to lidar_perception.nodes) and the dataclasses of its parameters
+# (relative to lidar_perception). scripts/nodes has a link for each name.
 NODES = {
-    "bag_player": ("BagPlayer", "params.PlayerParams"),
-    "bag_recorder": ("BagRecorder", "params.RecorderParams"),
-    "ground_segmentation": ("GroundSegmentation", "params.GroundNodeParams",
+    "bag_player": ("replay.bag_player.BagPlayer", "params.PlayerParams"),
+    "bag_recorder": ("replay.bag_recorder.BagRecorder", "params.RecorderParams"),
+    "ground_segmentation": ("ground_segmentation.GroundSegmentation", "params.GroundNodeParams",
                             "params.GroundRobotParams"),
-    "clustering": ("Clustering", "params.ClusteringNodeParams", _BOXES),
-    "candidate_refinement": ("CandidateRefinement", "params.RefinementNodeParams",
-                             _DETECTIONS),
-    "evaluator": ("Evaluator", "params.EvaluatorParams"),
-    "perception": ("Perception", "candidates.params.PipelineParams",
+    "clustering": ("clustering.Clustering", "params.ClusteringNodeParams", _BOXES),
+    "candidate_refinement": ("candidate_refinement.CandidateRefinement",
+                             "params.RefinementNodeParams", _DETECTIONS),
+    "evaluator": ("replay.evaluator.Evaluator", "params.EvaluatorParams"),
+    "perception": ("perception.Perception", "candidates.params.PipelineParams",
                    "params.PerceptionRobotParams"),
-    "pointpillars_detector": ("PointPillarsNode", "detectors.pointpillars.params.DetectorParams",
-                              _DETECTIONS),
-    "pointnet_detector": ("PointNetNode", "detectors.pointnet.params.PointNetDetectorParams",
-                          _DETECTIONS),
-    "fused_detector": ("FusedNode", "detectors.fused.params.FusedDetectorParams", _DETECTIONS),
-    "tracker": ("TrackerNode", "params.TrackerNodeParams", "params.TrackInputParams"),
+    "pointpillars_detector": ("pointpillars_detector.PointPillarsNode",
+                              "detectors.pointpillars.params.DetectorParams", _DETECTIONS),
+    "pointnet_detector": ("pointnet_detector.PointNetNode",
+                          "detectors.pointnet.params.PointNetDetectorParams", _DETECTIONS),
+    "fused_detector": ("fused_detector.FusedNode", "detectors.fused.params.FusedDetectorParams",
+                       _DETECTIONS),
+    "tracker": ("tracker.TrackerNode", "params.TrackerNodeParams", "params.TrackInputParams"),
 }
+
+
+def load_node_class(name: str) -> Any:
+    """Import and return the class of a node, given the name of its executable."""
+    module, _, class_name = NODES[name][0].rpartition(".")
+    return getattr(importlib.import_module(f"lidar_perception.nodes.{module}"), class_name)
 
 
 def require_rclpy() -> None:

@@ -7,7 +7,6 @@ only, and each function its own imports.
 
 from __future__ import annotations
 
-import importlib
 import os
 import re
 import signal
@@ -17,7 +16,7 @@ from itertools import pairwise
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from lidar_perception.nodes import NODES, require_rclpy
+from lidar_perception.nodes import load_node_class, require_rclpy
 
 if TYPE_CHECKING:
     from lidar_perception.nodes.runtime import LidarNode
@@ -64,11 +63,11 @@ def run(name: str, arguments: list[str]) -> int:
     from lidar_perception.runs.compiling import compilation_reported, one_at_a_time
     say = get_logger(_logger_name(arguments)).info
     with compilation_reported(say):
-        module = importlib.import_module(f"lidar_perception.nodes.{name}")
-        if hasattr(module, "warm_up"):
+        node_class = load_node_class(name)
+        if warm_up := getattr(sys.modules[node_class.__module__], "warm_up", None):
             with one_at_a_time(say):
-                module.warm_up()
-    return _spin(getattr(module, NODES[name][0]), arguments, begin, stop)
+                warm_up()
+    return _spin(node_class, arguments, begin, stop)
 
 
 def _logger_name(arguments: list[str]) -> str:

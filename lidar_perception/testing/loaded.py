@@ -3,12 +3,15 @@
 from contextlib import suppress
 from importlib import import_module
 
-from lidar_perception.nodes import NODES
+from lidar_perception.nodes import NODES, load_node_class
 from lidar_perception.runs.threads import one_thread_each
 
 one_thread_each()  # as nodes.main does
-for module in (*(f"nodes.{name}" for name in NODES), "nodes.stopping", "detectors.open"):
-    with suppress(ImportError):  # the node says it
+for name in NODES:
+    with suppress(ImportError):  # the node reports it when it starts
+        load_node_class(name)
+for module in ("nodes.stopping", "detectors.open"):
+    with suppress(ImportError):
         import_module(f"lidar_perception.{module}")
 with suppress(ImportError):
     from lidar_perception.candidates.warm_up import warm_up

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import os
 from pathlib import Path
@@ -14,7 +13,7 @@ from rclpy.logging import LoggingSeverity, set_logger_level
 from fuzz.case import FAILED, REFUSED, SURVIVED, Outcome
 from fuzz.valid_messages import CLOUD, valid_message
 from lidar_perception.candidates.warm_up import warm_up
-from lidar_perception.nodes import NODES
+from lidar_perception.nodes import load_node_class
 from lidar_perception.nodes.graph import private_domain
 from lidar_perception.nodes.reception import Reception
 from lidar_perception.nodes.runtime import ERROR, MARKERS, OK
@@ -85,8 +84,7 @@ class FedNode:
     """A node whose messages are delivered by calls, and whose output is kept in `sent`."""
 
     def __init__(self, name: str, context: Context, **values: Any):
-        module = importlib.import_module(f"lidar_perception.nodes.{name}")
-        self.node = getattr(module, NODES[name][0])(
+        self.node = load_node_class(name)(
             context=context, enable_rosout=False, start_parameter_services=False,
             parameter_overrides=parameters_of(values))
         self.node.start()

@@ -20,8 +20,8 @@ from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.cli.demo import RECORD, demo
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.nodes import replay
 from lidar_perception.nodes.graph import FINAL, result_topics
+from lidar_perception.nodes.replay import graph_replay
 from lidar_perception.scoring.recorded import answered
 from lidar_perception.types import InputError
 
@@ -47,7 +47,7 @@ def test_the_demo_scores_what_fused_finds_offline(drive_bag, make_bag, tmp_path)
     assert (tmp_path / "birdseye.png").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize(("real_time", "waiting"), [(False, replay.AHEAD), (True, None)])
+@pytest.mark.parametrize(("real_time", "waiting"), [(False, graph_replay.AHEAD), (True, None)])
 def test_in_real_time_as_many_clouds_wait_as_on_a_robot(
         drive_bag, tmp_path, monkeypatch, real_time, waiting):
     class Enough(Exception):
@@ -57,9 +57,9 @@ def test_in_real_time_as_many_clouds_wait_as_on_a_robot(
         assert values.get("input.queue") == waiting  # None: the node's own
         raise Enough
 
-    monkeypatch.setattr(replay.Processes, "start", start)
+    monkeypatch.setattr(graph_replay.Processes, "start", start)
     with pytest.raises(Enough):
-        replay.replay(drive_bag, 1, tmp_path, PAPER, real_time=real_time)
+        graph_replay.replay(drive_bag, 1, tmp_path, PAPER, real_time=real_time)
 
 
 @pytest.mark.parametrize(("arguments", "node", "expected"), [
@@ -76,7 +76,7 @@ def test_parameters_reach_the_nodes(drive_bag, tmp_path, monkeypatch, arguments,
         if name == "bag_recorder":
             raise InputError("enough")
 
-    monkeypatch.setattr(replay.Processes, "start", start)
+    monkeypatch.setattr(graph_replay.Processes, "start", start)
     assert exit_of(monkeypatch, "demo", drive_bag, *arguments, "--out", tmp_path / "out") == 2
     assert expected.items() <= given[node].items()
 

@@ -11,7 +11,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from tracking_samples import START, TENTH, crowd
 
-from lidar_perception.nodes.evaluator import WAITING_FRAMES, Evaluator
+from lidar_perception.nodes.replay.evaluator import WAITING_FRAMES, Evaluator
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_detection_markers

@@ -14,7 +14,7 @@ from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
 from lidar_perception.nodes.graph import cloud_topic, result_topics
-from lidar_perception.nodes.replay import replay
+from lidar_perception.nodes.replay.graph_replay import replay
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.report import (
     CandidateReport,
@@ -52,7 +52,7 @@ def run(setting, drive_bag, tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
     with Bag(drive_bag) as bag, pytest.MonkeyPatch.context() as patch:
         clouds = bag.counts[POINTS]
-        patch.setattr("lidar_perception.nodes.replay.Processes", NodesUnderTest)
+        patch.setattr("lidar_perception.nodes.replay.graph_replay.Processes", NodesUnderTest)
         return single, replay(drive_bag, clouds, out, params, single=single), out
 
 

@@ -128,7 +128,8 @@ def test_arguments_that_ros_does_not_take_are_one_line_and_exit_code_2(domain):
 import sys
 from time import sleep
 from types import SimpleNamespace
-from lidar_perception.nodes import bag_player, main, perception
+from lidar_perception.nodes import main, perception
+from lidar_perception.nodes.replay import bag_player
 stop = SimpleNamespace(closing=lambda: None, closed=lambda code: None)
 for given in sys.argv[1:]:
     kind = bag_player.BagPlayer if "bag" in given else perception.Perception

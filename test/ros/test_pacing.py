@@ -12,8 +12,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from lidar_perception.nodes import pacing
 from lidar_perception.nodes.graph import chosen_clouds
+from lidar_perception.nodes.replay import pacing
 from lidar_perception.runs.threads import WAIT_ASLEEP
 from lidar_perception.types import InputError
 

@@ -96,7 +96,7 @@ def test_a_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
 def test_of_static_transforms_all_hold_and_of_other_latched_topics_the_last(
         monkeypatch, start, tmp_path):
     """Each node that publishes them sends its own, once."""
-    from lidar_perception.nodes import bag_player
+    from lidar_perception.nodes.replay import bag_player
     monkeypatch.setattr(bag_player, "TF_MESSAGE", TEXT)  # which the wheels of ROS lack
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/tf_static", TEXT, LATCHED_QOS)
@@ -116,7 +116,7 @@ def test_of_static_transforms_all_hold_and_of_other_latched_topics_the_last(
 
 def test_livox_and_compressed_clouds_are_played_as_point_clouds(start, tmp_path):
     """A cloud that cannot be converted is left out; the others, and other topics, are played."""
-    from lidar_perception.nodes.bag_player import BagPlayer
+    from lidar_perception.nodes.replay.bag_player import BagPlayer
     points = livox_points()
     plain = np.zeros(3, [(axis, "<f4") for axis in "xyz"])
     with BagWriter(tmp_path / "bag") as bag:
@@ -142,7 +142,7 @@ def test_livox_and_compressed_clouds_are_played_as_point_clouds(start, tmp_path)
 
 
 def test_a_wrong_metadata_is_a_warning_and_the_bag_is_played(start, text_bag, tmp_path, capfd):
-    from lidar_perception.nodes.bag_player import BagPlayer
+    from lidar_perception.nodes.replay.bag_player import BagPlayer
     shutil.copytree(text_bag, tmp_path / "bag")
     metadata = yaml.safe_load((text_bag / "metadata.yaml").read_text())
     metadata["rosbag2_bagfile_information"].update(
@@ -157,7 +157,7 @@ def test_a_wrong_metadata_is_a_warning_and_the_bag_is_played(start, text_bag, tm
 
 
 def test_a_topic_of_several_publishers_is_offered_as_the_best_of_them_did():
-    from lidar_perception.nodes.bag_player import _qos
+    from lidar_perception.nodes.replay.bag_player import _qos
 
     def profile(reliability, durability):
         return SimpleNamespace(depth=1, reliability=SimpleNamespace(name=reliability),
@@ -185,7 +185,7 @@ def test_pause_step_resume_and_rate(processes, peer, text_bag):
 
 
 def test_bag_time_runs_at_the_rate_and_stands_still_while_paused(monkeypatch):
-    from lidar_perception.nodes import bag_player
+    from lidar_perception.nodes.replay import bag_player
     from lidar_perception.params import PlayerParams
     player = bag_player.BagPlayer.__new__(bag_player.BagPlayer)
     player.now_ns, player.anchor, player.paused, player.clock = START, 50.0, False, None
@@ -203,7 +203,7 @@ def test_bag_time_runs_at_the_rate_and_stands_still_while_paused(monkeypatch):
 
 
 def test_the_clock_has_its_rate_where_messages_are_rare(monkeypatch):
-    from lidar_perception.nodes import bag_player
+    from lidar_perception.nodes.replay import bag_player
     from lidar_perception.params import PlayerParams
     player, now, sent = bag_player.BagPlayer.__new__(bag_player.BagPlayer), [50.0], []
     player.now_ns, player.anchor, player.paused, player.steps = START, now[0], False, 0
@@ -340,7 +340,7 @@ def test_a_publisher_that_comes_later_and_offers_less_is_recorded_too(processes,
 
 
 def test_a_type_that_is_not_installed_ends_no_recording(monkeypatch, peer, start, tmp_path):
-    from lidar_perception.nodes import bag_recorder
+    from lidar_perception.nodes.replay import bag_recorder
     known = bag_recorder.message_class
 
     def lacking(name):
@@ -359,7 +359,7 @@ def test_a_type_that_is_not_installed_ends_no_recording(monkeypatch, peer, start
 
 def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tmp_path):
     """What waits has a bound, whatever comes; the clock of a simulation may stand."""
-    from lidar_perception.nodes import bag_recorder
+    from lidar_perception.nodes.replay import bag_recorder
     monkeypatch.setattr(bag_recorder, "MAX_WAITING", 100)
     held = threading.Event()
     monkeypatch.setattr(bag_recorder.BagWriter, "write", lambda *_: held.wait())
@@ -383,7 +383,7 @@ def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tm
 
 def test_a_bag_of_one_message_in_a_loop_floods_nobody_and_hears_its_services(
         monkeypatch, tmp_path):
-    from lidar_perception.nodes import bag_player
+    from lidar_perception.nodes.replay import bag_player
     from lidar_perception.params import PlayerParams
     player, now, sent, served = bag_player.BagPlayer.__new__(bag_player.BagPlayer), [50.0], [], []
     player.params, player.wanted, player.clock = PlayerParams(loop=True), {}, None

@@ -3,7 +3,6 @@ name, with that type, and a costmap finds the obstacles there."""
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 from pathlib import Path
@@ -21,7 +20,7 @@ from lidar_perception.data.bag import Bag
 from lidar_perception.ground.obstacles import find_obstacles
 from lidar_perception.ground.params import ObstacleParams
 from lidar_perception.ground.segment import segment_ground
-from lidar_perception.nodes import NODES
+from lidar_perception.nodes import load_node_class
 from lidar_perception.nodes.graph import BEHIND, SINGLE, graph_of
 from lidar_perception.nodes.watch import leave, new_context
 from lidar_perception.wire.messages import to_frame
@@ -59,9 +58,8 @@ def graph(domain):
     nodes, types, offered = [], {}, {}
     for name, remap in {**graph_of([*BEHIND]), **SINGLE,
                         **graph_of(["candidates"], tracking=True)}.items():
-        module = importlib.import_module(f"lidar_perception.nodes.{name}")
         rules = [word for rule in remap.items() for word in ("-r", ":=".join(rule))]
-        node = getattr(module, NODES[name][0])(context=context, cli_args=["--ros-args", *rules])
+        node = load_node_class(name)(context=context, cli_args=["--ros-args", *rules])
         node.start()  # managed nodes have their topics then
         nodes.append(node)
         types.update((t, kinds[0]) for t, kinds in node.get_subscriber_names_and_types_by_node(

@@ -16,7 +16,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from lidar_perception.data.bag import Bag
-from lidar_perception.nodes.pacing import Pace
+from lidar_perception.nodes.replay.pacing import Pace
 from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
 from lidar_perception.nodes.transforms import STATIC_QOS
 from lidar_perception.params import PlayerParams
