@@ -17,8 +17,8 @@ from rich.table import Table
 
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.robot.deskew import deskewed
-from lidar_perception.robot.poses import interpolated
+from lidar_perception.robot.deskew import deskew
+from lidar_perception.robot.poses import interpolate_poses
 from lidar_perception.runs.terminal import console
 from lidar_perception.simulation.drive import truth
 from lidar_perception.simulation.raycast import cast
@@ -45,7 +45,7 @@ def odometry(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def where(way: tuple[np.ndarray, np.ndarray, np.ndarray], at: np.ndarray) -> np.ndarray:
     """(N, 4, 4): the poses of an odometry at (N,) seconds."""
-    return interpolated(*way, np.rint(at * 1e9).astype(np.int64))
+    return interpolate_poses(*way, np.rint(at * 1e9).astype(np.int64))
 
 
 def turns(seed: int) -> Iterator[tuple]:
@@ -58,7 +58,7 @@ def turns(seed: int) -> Iterator[tuple]:
         hits = cast(moment.solids, scene.ground, moment.position, HDL64E, motion, seed)
         met, reported = (returns_of(hits, HDL64E, motion, np.random.default_rng(seed), compensated)
                          for compensated in (True, False))
-        corrected = deskewed(reported.xyz, met.time.astype(float), partial(where, odometry(motion)))
+        corrected = deskew(reported.xyz, met.time.astype(float), partial(where, odometry(motion)))
         since = rays(HDL64E, motion).since.astype(np.float32)
         order = np.argsort(since)
         solid = hits.solid[order[np.searchsorted(since[order], met.time)], met.ring]

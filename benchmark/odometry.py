@@ -23,7 +23,7 @@ from rich.table import Table
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.robot.poses import inverse
+from lidar_perception.robot.poses import invert_pose
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.simulation.drive import scans
 from lidar_perception.tracking.ego import Odometry
@@ -92,8 +92,8 @@ def measured(given: Scans, detectors: tuple[str, ...]) -> dict[str, dict[str, fl
 
 def _off(poses: np.ndarray, true: np.ndarray, step: int) -> np.ndarray:
     """(frames - step,) metres seen from above between two motions over `step` frames."""
-    there, meant = (inverse(p[:-step]) @ p[step:] for p in (poses, true))
-    return np.linalg.norm((inverse(meant) @ there)[:, :2, 3], axis=1)
+    there, meant = (invert_pose(p[:-step]) @ p[step:] for p in (poses, true))
+    return np.linalg.norm((invert_pose(meant) @ there)[:, :2, 3], axis=1)
 
 
 @click.command()

@@ -1,4 +1,4 @@
-"""The camera's view of the LiDAR frame."""
+"""Pinhole camera and its calibration relative to the LiDAR."""
 
 from __future__ import annotations
 
@@ -10,52 +10,59 @@ from scipy.spatial.transform import Rotation
 
 from lidar_perception.types import InputError
 
-MOST_PIXELS = 1 << 20  # of a side of an image
+MAX_PIXELS = 1 << 20  # along a side of an image
 
 
 @dataclass(frozen=True)
 class Camera:
-    """projection (3, 4) float64: homogeneous LiDAR points to pixels times depth; width and
-    height of the image in pixels."""
+    """A camera that sees points in the LiDAR frame.
+
+    projection (3, 4) float64 maps homogeneous LiDAR points to pixels times depth; width and height
+    are those of the image in pixels.
+    """
 
     projection: np.ndarray
     width: int
     height: int
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.projection).all() and 0 < self.width < MOST_PIXELS
-                and 0 < self.height < MOST_PIXELS):
-            raise InputError("the camera's calibration has a number that is not finite, or an "
+        if not (np.isfinite(self.projection).all() and 0 < self.width < MAX_PIXELS
+                and 0 < self.height < MAX_PIXELS):
+            raise InputError("the camera's calibration has a value that is not finite, or an "
                              f"image of {self.width} x {self.height} pixels; calibrate it again")
 
     @staticmethod
-    def of(intrinsics: np.ndarray, rotation: np.ndarray, translation: np.ndarray, width: int,
-           height: int) -> Camera:
-        """From P (3, 4) of CameraInfo or KITTI and the camera's pose in the LiDAR frame, as TF
-        has it: rotation a quaternion [x y z w], translation (3,) metres. The camera frame is
-        optical: x right, y down, z forward."""
+    def from_camera_pose(intrinsics: np.ndarray, rotation: np.ndarray, translation: np.ndarray,
+                         width: int, height: int) -> Camera:
+        """Make a camera of P (3, 4), as in CameraInfo or KITTI, and its pose in the LiDAR frame.
+
+        The pose is that of TF: rotation is a quaternion [x y z w], translation (3,) in metres. The
+        camera frame is optical: x right, y down, z forward.
+        """
         to_lidar = Rotation.from_quat(rotation)
-        return Camera.of_lidar_pose(intrinsics, to_lidar.inv().as_quat(),
-                                    -to_lidar.inv().apply(translation), width, height)
+        return Camera.from_lidar_pose(intrinsics, to_lidar.inv().as_quat(),
+                                      -to_lidar.inv().apply(translation), width, height)
 
     @staticmethod
-    def of_lidar_pose(intrinsics: np.ndarray, rotation: np.ndarray, translation: np.ndarray,
-                      width: int, height: int) -> Camera:
-        """As of(), from the LiDAR's pose in the camera frame."""
+    def from_lidar_pose(intrinsics: np.ndarray, rotation: np.ndarray, translation: np.ndarray,
+                        width: int, height: int) -> Camera:
+        """Make a camera of P (3, 4) and the LiDAR's pose in the camera frame."""
         lidar_to_camera = np.eye(4)
         lidar_to_camera[:3, :3] = Rotation.from_quat(rotation).as_matrix()
         lidar_to_camera[:3, 3] = translation
-        with np.errstate(invalid="ignore", over="ignore"):  # Camera checks it
+        with np.errstate(invalid="ignore", over="ignore"):  # Camera checks the result
             projection = np.asarray(intrinsics, float).reshape(3, 4) @ lidar_to_camera
         return Camera(projection, int(width), int(height))
 
     def in_view(self, xyz: np.ndarray) -> np.ndarray:
-        """(N,) bool: points (N, 3) in front of the camera that fall into the image."""
+        """Return (N,) bool: True for points (N, 3) in front of the camera and inside the image."""
         return _in_view(np.ascontiguousarray(xyz), self.projection, self.width, self.height)
 
     def in_regions(self, xyz: np.ndarray, regions: np.ndarray) -> np.ndarray:
-        """(N,) bool: points (N, 3) in front of the camera that fall into any of regions (R, 4)
-        [left top right bottom], pixels; the image's border does not matter."""
+        """Return (N,) bool: True for points (N, 3) in front of the camera and inside any region.
+
+        regions (R, 4) are [left top right bottom] in pixels and may extend beyond the image.
+        """
         u, v, depth = (np.asarray(xyz, np.float64) @ self.projection[:, :3].T
                        + self.projection[:, 3]).T
         inside = np.zeros(len(xyz), bool)
@@ -80,8 +87,12 @@ def _in_view(xyz, projection, width, height):
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """intrinsics P2 (3, 4); lidar_to_camera (4, 4) velodyne points into the rectified camera
-    frame (R0_rect Tr_velo_to_cam); image width and height in pixels."""
+    """Calibration of a camera.
+
+    intrinsics (3, 4) is P2 of KITTI; lidar_to_camera (4, 4) transforms LiDAR points to the
+    rectified camera frame (R0_rect Tr_velo_to_cam); width and height are those of the image in
+    pixels.
+    """
 
     intrinsics: np.ndarray
     lidar_to_camera: np.ndarray
@@ -90,21 +101,23 @@ class Calibration:
 
     @property
     def pose(self) -> tuple[np.ndarray, np.ndarray]:
-        """The camera in the LiDAR frame as TF has it: quaternion [x y z w], translation (3,)."""
+        """Pose of the camera in the LiDAR frame: quaternion [x y z w], translation (3,)."""
         to_lidar = Rotation.from_matrix(self.lidar_to_camera[:3, :3].T)
         return to_lidar.as_quat(), -to_lidar.apply(self.lidar_to_camera[:3, 3])
 
     def equals(self, other: Calibration | None) -> bool:
-        """Whether the other one has the same numbers."""
+        """Return True if the other calibration has the same values."""
         return other is not None and all(
             np.array_equal(a, b) for a, b in zip(vars(self).values(), vars(other).values()))
 
     def camera(self) -> Camera:
+        """Return the camera with this calibration."""
         rotation, translation = self.pose
-        return Camera.of(self.intrinsics, rotation, translation, self.width, self.height)
+        return Camera.from_camera_pose(self.intrinsics, rotation, translation, self.width,
+                                       self.height)
 
 
-# A nominal camera, of the simulator and where a recording has none: KITTI's field of view, level,
+# Nominal camera of the simulator and of recordings without one: KITTI's field of view, level,
 # 0.27 m ahead of the LiDAR and 0.08 m below it.
 FORWARD_CAMERA = Calibration(
     intrinsics=np.array([[720.0, 0, 621, 0], [0, 720, 187.5, 0], [0, 0, 1, 0]]),

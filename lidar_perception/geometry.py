@@ -1,4 +1,4 @@
-"""Boxes, ranges, and a counting sort; frames as in types.py."""
+"""Boxes, their overlap, ranges, and a counting sort; frames as in types.py."""
 
 from __future__ import annotations
 
@@ -10,43 +10,47 @@ from numpy.typing import ArrayLike
 
 
 def wrap_angle(angle: ArrayLike) -> np.ndarray:
-    """The same angle in [-pi, pi)."""
+    """Return the same angle in [-pi, pi)."""
     wrapped = (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
-    return np.where(wrapped >= np.pi, -np.pi, wrapped)[()]  # a hair below -pi rounds to pi
+    return np.where(wrapped >= np.pi, -np.pi, wrapped)[()]  # values just below -pi round to pi
 
 
 def wrap_line(angle: ArrayLike) -> np.ndarray:
-    """The angle in [-pi/2, pi/2) of the same line, either way along it."""
+    """Return the angle in [-pi/2, pi/2) of the same line, in either direction."""
     return wrap_angle(2 * np.asarray(angle)) / 2
 
 
 def horizontal_range(xyz: np.ndarray) -> np.ndarray:
-    """(N,) distance from the sensor in the x-y plane, dtype of xyz. xyz is (N, >=2)."""
+    """Return (N,) distance from the sensor in the x-y plane, in the dtype of xyz (N, >=2)."""
     return np.sqrt(xyz[:, 0] * xyz[:, 0] + xyz[:, 1] * xyz[:, 1])
 
 
-def elevations(xyz: np.ndarray) -> np.ndarray:
-    """(N,) radians above the horizon of the origin, of points (N, >=3)."""
+def elevation_angles(xyz: np.ndarray) -> np.ndarray:
+    """Return (N,) angle of points (N, >=3) above the horizon of the origin, in radians."""
     return np.asarray(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
 
 
-def within(at: np.ndarray, low: ArrayLike, high: ArrayLike) -> np.ndarray:
-    """(N,) bool: whether x and y of points, or of boxes, (N, >=2) are at least low and less than
-    high, of which x and y count, too; not what is NaN."""
+def is_within(at: np.ndarray, low: ArrayLike, high: ArrayLike) -> np.ndarray:
+    """Return (N,) bool: True where low <= x, y < high for points or boxes (N, >=2); False for NaN.
+
+    Only x and y of low and high (>=2,) count.
+    """
     flat, low, high = at[:, :2], np.asarray(low)[:2], np.asarray(high)[:2]
     return np.asarray(((flat >= low) & (flat < high)).all(axis=1))
 
 
 def to_box_frame(xyz: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """(N, 3) points relative to the centre of box (7,), rotated so that x runs along its length."""
+    """Transform points (N, 3) to the frame of box (7,), with x along its length."""
     cos, sin = np.cos(box[6]), np.sin(box[6])
     dx, dy = xyz[:, 0] - box[0], xyz[:, 1] - box[1]
     return np.stack([cos * dx + sin * dy, cos * dy - sin * dx, xyz[:, 2] - box[2]], axis=1)
 
 
 def points_in_box(xyz: np.ndarray, box: np.ndarray, margin: float = 0.0) -> np.ndarray:
-    """(N,) bool: points (N, 3 or more) inside box (7,) grown by margin metres on every side; faces
-    count."""
+    """Return (N,) bool: True for points (N, >=3) inside box (7,) or on its faces.
+
+    The box is enlarged by margin metres on every side.
+    """
     half = np.asarray(box[3:6], np.float64) / 2 + margin
     inside = np.zeros(len(xyz), bool)
     near = np.flatnonzero(np.abs(xyz[:, 0] - np.float32(box[0])) <= np.hypot(*half[:2]) + 1e-3)
@@ -56,31 +60,42 @@ def points_in_box(xyz: np.ndarray, box: np.ndarray, margin: float = 0.0) -> np.n
 
 def points_in_boxes(xyz: np.ndarray, boxes: np.ndarray,
                     margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """points_in_box of every box (K, 7) at once: indices (M,) int64 of points (N, 3), those of box
-    k from first[k] to first[k + 1], ascending, and first (K + 1,) int64. A point can be in
-    several. Time grows with K times N, so K is of detections, not of points."""
+    """Find the points (N, 3) inside each of the boxes (K, 7), as points_in_box does.
+
+    A point can be in several boxes. The time grows with K * N: meant for detections.
+
+    Returns:
+        indices (M,) int64 of the points, those of box k in first[k]:first[k + 1], ascending; and
+        first (K + 1,) int64.
+    """
     boxes = np.ascontiguousarray(boxes, np.float32).reshape(-1, 7)
     xyz = np.ascontiguousarray(xyz[:, :3], np.float32)
     reach = np.hypot(boxes[:, 3] / 2.0 + margin, boxes[:, 4] / 2.0 + margin) + 1e-3
     begin, end = boxes[:, 0] - reach, boxes[:, 0] + reach
-    low = max(_lowest(begin), _lowest(xyz[:, 0]), -FAR)
-    high = min(-_lowest(-end), -_lowest(-xyz[:, 0]), FAR)
+    low = max(_finite_min(begin), _finite_min(xyz[:, 0]), -MAX_DISTANCE_M)
+    high = min(-_finite_min(-end), -_finite_min(-xyz[:, 0]), MAX_DISTANCE_M)
     return _points_in_boxes(xyz, boxes, margin, begin, end, low, high)
 
 
-SLABS = 256  # across x, between low and high, in which the points of a box are looked for
-FAR = 1e9    # m: nothing is
+SLAB_COUNT = 256      # slabs across x in which the points of a box are searched
+MAX_DISTANCE_M = 1e9  # no point is farther
 
 
-def _lowest(values: np.ndarray) -> float:
-    """The least that is a number, inf where there is none."""
+def _finite_min(values: np.ndarray) -> float:
+    """Return the smallest number that is not NaN, inf if there is none."""
     return float(np.fmin.reduce(values, initial=np.inf))
 
 
 @njit(cache=True, nogil=True)
-def stable_order(keys, count, first):
-    """order (N,): `first` reordered by keys (N,) 0..count-1, equal keys keep their order; and start
-    (count + 1,): those of key k are from start[k] to start[k + 1]. Counting sort."""
+def counting_sort(keys, count, first):
+    """Sort indices stably by their keys (N,), 0..count-1.
+
+    Args:
+        first: (N,) indices in the order that equal keys keep.
+
+    Returns:
+        order (N,), and start (count + 1,): the indices with key k are order[start[k]:start[k + 1]].
+    """
     start = np.zeros(count + 1, np.int64)
     for key in keys:
         start[key + 1] += 1
@@ -95,12 +110,12 @@ def stable_order(keys, count, first):
 
 @njit(cache=True, nogil=True)
 def _points_in_boxes(xyz, boxes, margin, begin, end, low, high):
-    scale = (SLABS - 1) / max(high - low, 1e-3)
-    slab = np.full(len(xyz), SLABS)  # of what no box can hold, too
+    scale = (SLAB_COUNT - 1) / max(high - low, 1e-3)
+    slab = np.full(len(xyz), SLAB_COUNT)  # the last slab holds points that no box can contain
     for i in range(len(xyz)):
         if low <= xyz[i, 0] <= high:
             slab[i] = int((xyz[i, 0] - low) * scale)
-    order, start = stable_order(slab, SLABS + 1, np.arange(len(xyz)))
+    order, start = counting_sort(slab, SLAB_COUNT + 1, np.arange(len(xyz)))
     first, inside = np.zeros(len(boxes) + 1, np.int64), np.empty(len(order), np.int64)
     count = 0
     for k in range(len(boxes)):
@@ -110,10 +125,10 @@ def _points_in_boxes(xyz, boxes, margin, begin, end, low, high):
         height = boxes[k, 5] / 2.0 + margin
         left, right = max(begin[k], low), min(end[k], high)
         if left <= right:
-            some = order[start[int((left - low) * scale)]:start[int((right - low) * scale) + 1]]
-            if count + len(some) > len(inside):
-                inside = np.concatenate((inside, np.empty(len(inside) + len(some), np.int64)))
-            for i in some:
+            near = order[start[int((left - low) * scale)]:start[int((right - low) * scale) + 1]]
+            if count + len(near) > len(inside):
+                inside = np.concatenate((inside, np.empty(len(inside) + len(near), np.int64)))
+            for i in near:
                 dx, dy = xyz[i, 0] - x, xyz[i, 1] - y
                 if (abs(cos * dx + sin * dy) <= length and abs(cos * dy - sin * dx) <= width
                         and abs(xyz[i, 2] - z) <= height):
@@ -125,13 +140,16 @@ def _points_in_boxes(xyz, boxes, margin, begin, end, low, high):
 
 
 def centre_distances(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """(K, M) metres from above between the centres of boxes (K, 7) and others (M, 7)."""
+    """Return (K, M) distance in x-y between the centres of boxes (K, 7) and others (M, 7)."""
     return np.hypot(*(boxes[:, None, :2] - others[None, :, :2]).transpose(2, 0, 1))
 
 
 def box_corners(boxes: np.ndarray) -> np.ndarray:
-    """(K, 8, 3) corners of boxes (K, 7): four at the bottom, counter-clockwise from front left
-    (seen from above), then the four above them."""
+    """Return the corners (K, 8, 3) of boxes (K, 7).
+
+    The first four are at the bottom, counter-clockwise from front left seen from above; the other
+    four are above them.
+    """
     signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
     flat = signs * boxes[:, None, 3:5]
     cos, sin = np.cos(boxes[:, None, 6]), np.sin(boxes[:, None, 6])
@@ -142,42 +160,44 @@ def box_corners(boxes: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack([x, y, below], -1), np.stack([x, y, above], -1)], axis=1)
 
 
-MAX_CORNERS = 8  # of what two rectangles share; four cuts add one corner each
+MAX_CORNERS = 8  # of the overlap of two rectangles: clipping at four sides adds one corner each
 
 
 def bev_and_3d_iou(boxes: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two (K, M) float64, 0..1: IoU seen from above and in space of boxes (K, 7) and others
-    (M, 7), [x y z l w h yaw] with z up. A box without area (without volume, in space), or with a
-    number that is not finite, overlaps nothing, not even itself."""
-    return _ious(_rows(boxes), _rows(others))
+    """Return BEV IoU and 3D IoU, each (K, M) float64 0..1, of boxes (K, 7) and others (M, 7).
+
+    A box without area (BEV) or volume (3D), or with a value that is not finite, has IoU 0 with
+    every box, also with itself.
+    """
+    return _compute_ious(_to_rows(boxes), _to_rows(others))
 
 
 def bev_iou(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """(K, M) float64, 0..1: IoU seen from above, as in bev_and_3d_iou."""
+    """Return the BEV IoU (K, M) of bev_and_3d_iou."""
     return bev_and_3d_iou(boxes, others)[0]
 
 
 def iou_3d(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """(K, M) float64, 0..1: IoU in space, as in bev_and_3d_iou."""
+    """Return the 3D IoU (K, M) of bev_and_3d_iou."""
     return bev_and_3d_iou(boxes, others)[1]
 
 
-def _rows(boxes: np.ndarray) -> np.ndarray:
+def _to_rows(boxes: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(boxes, np.float64).reshape(-1, 7)
 
 
 @njit(cache=True, nogil=True)
-def _ious(boxes, others):
+def _compute_ious(boxes, others):
     bev = np.zeros((len(boxes), len(others)))
     space = np.zeros((len(boxes), len(others)))
-    reach, other_reach = reaches(boxes), reaches(others)
+    reach, other_reach = footprint_radii(boxes), footprint_radii(others)
     work = np.empty((4, MAX_CORNERS))
     for i in range(len(boxes)):
         a = boxes[i]
         area_a = a[3] * a[4]
         for j in range(len(others)):
             b = others[j]
-            shared = shared_area(a, b, reach[i] + other_reach[j], work)
+            shared = overlap_area(a, b, reach[i] + other_reach[j], work)
             if shared <= 0:
                 continue
             area_b = b[3] * b[4]
@@ -191,9 +211,11 @@ def _ious(boxes, others):
 
 
 @njit(cache=True, nogil=True)
-def reaches(boxes):
-    """(K,) how far the corners of boxes (K, 7) are from their centres, from above; NaN where a
-    length or width is not above 0 or a number not finite."""
+def footprint_radii(boxes):
+    """Return (K,) the distance of the corners of boxes (K, 7) from their centres in x-y.
+
+    NaN for boxes without area or with a value that is not finite.
+    """
     found = np.full(len(boxes), np.nan)
     for i in range(len(boxes)):
         if boxes[i, 3] > 0 and boxes[i, 4] > 0 and np.isfinite(boxes[i]).all():
@@ -202,9 +224,12 @@ def reaches(boxes):
 
 
 @njit(cache=True, nogil=True)
-def shared_area(a, b, reach, work):
-    """Area that two boxes (7,) share from above; 0 where their centres are not within reach, the
-    sum of their reaches, or this is NaN. work (4, MAX_CORNERS) float64 is overwritten."""
+def overlap_area(a, b, reach, work):
+    """Return the area of the overlap of two boxes (7,) in x-y.
+
+    reach is the sum of their footprint radii; the area is 0 if it is NaN or the centres are farther
+    apart. work (4, MAX_CORNERS) float64 is overwritten.
+    """
     dx, dy = a[0] - b[0], a[1] - b[1]
     if not dx * dx + dy * dy < reach * reach:
         return 0.0
@@ -217,10 +242,10 @@ def shared_area(a, b, reach, work):
         across = a[4] / 2 if k < 2 else -a[4] / 2
         x[k] = centre_x + cos * along - sin * across
         y[k] = centre_y + sin * along + cos * across
-    count = _cut(x, y, 4, 1.0, b[3] / 2, cut_x, cut_y)
-    count = _cut(cut_x, cut_y, count, -1.0, b[3] / 2, x, y)
-    count = _cut(y, x, count, 1.0, b[4] / 2, cut_y, cut_x)
-    count = _cut(cut_y, cut_x, count, -1.0, b[4] / 2, y, x)
+    count = _clip(x, y, 4, 1.0, b[3] / 2, cut_x, cut_y)
+    count = _clip(cut_x, cut_y, count, -1.0, b[3] / 2, x, y)
+    count = _clip(y, x, count, 1.0, b[4] / 2, cut_y, cut_x)
+    count = _clip(cut_y, cut_x, count, -1.0, b[4] / 2, y, x)
     area = 0.0
     for k in range(1, count - 1):
         area += (x[k] - x[0]) * (y[k + 1] - y[0]) - (x[k + 1] - x[0]) * (y[k] - y[0])
@@ -228,9 +253,11 @@ def shared_area(a, b, reach, work):
 
 
 @njit(cache=True, nogil=True)
-def _cut(u, v, count, sign, limit, kept_u, kept_v):
-    """The part of a convex polygon u, v (count corners) where sign * u <= limit, into kept_u and
-    kept_v; returns the number of its corners."""
+def _clip(u, v, count, sign, limit, kept_u, kept_v):
+    """Clip a convex polygon u, v with `count` corners to sign * u <= limit.
+
+    Writes the corners to kept_u and kept_v and returns their number.
+    """
     kept = 0
     for k in range(count):
         following = k + 1 if k + 1 < count else 0

@@ -1,7 +1,7 @@
-"""The scale of intensities: drivers write 0..1, percent, 8, 10, 12 or 16 bits; the core takes 0..1.
+"""Scale of intensities: drivers write 0..1, percent, 8, 10, 12 or 16 bits; the core uses 0..1.
 
-Every source goes through `full_scale`, which infers the scale where nobody declares it, and
-`to_unit`, which applies it. See docs/reference/recordings.md#intensity.
+Every source uses `infer_full_scale`, which infers a scale that is not declared, and `to_unit`,
+which applies it. See docs/reference/recordings.md#intensity.
 """
 
 from __future__ import annotations
@@ -9,29 +9,29 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import DTypeLike
 
-MAX_UNIT = 1.5        # a cloud in 0..1 exceeds 1 by noise and calibration, but not this
+MAX_UNIT = 1.5         # noise and calibration make intensities of 0..1 exceed 1, but not this value
 PERCENT = 100.0
 BITS = (255.0, 1023.0, 4095.0, 65535.0)  # 8, 10, 12 and 16 bits
-TOLERANCE = 1.001     # by which a value may exceed its scale: rounding
-MAX_OUTLIERS = 1e-4   # share of the values of a cloud that may lie beyond its scale
-WHOLE_SAMPLE = 10_000  # values that are checked for being whole numbers
-MIN_BRIGHT = 0.05     # a cloud of MIN_POINTS whose values all lie below has another scale
+TOLERANCE = 1.001      # factor by which rounding lets a value exceed its scale
+MAX_OUTLIERS = 1e-4    # share of the values of a cloud that may exceed its scale
+WHOLE_SAMPLE = 10_000  # number of values that are checked for being whole numbers
+MIN_BRIGHT = 0.05      # a cloud of MIN_POINTS points with lower values only has another scale
 MIN_POINTS = 1000
-INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # the first one that a cloud has counts
+INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # a cloud's first one counts
 
 
-def full_scale(values: np.ndarray, dtype: DTypeLike | None = None) -> float:
-    """Infer which value means a full reflection, from one cloud.
+def infer_full_scale(values: np.ndarray, dtype: DTypeLike | None = None) -> float:
+    """Infer from one cloud which value means a full reflection.
 
     8-bit integers: the largest number of their type. Wider integers: the smallest of 255, 1023,
-    4095 and 65535 that holds the values. Floats: 1 up to MAX_UNIT; percent (100) where the values
-    have fractions and end there; else as for integers. No values, or only zeros, give the smallest
-    scale of their type.
+    4095 and 65535 that is not exceeded. Floats: 1 if MAX_UNIT is not exceeded; 100 (percent) if 100
+    is not exceeded and there are fractions; else as for integers. Without values, or with zeros
+    only, the smallest scale of the type.
 
     Args:
-        values: (N,) intensities as the driver wrote them. NaN, infinite and negative ones, and a
-            share of MAX_OUTLIERS, do not count.
-        dtype: type in which the driver wrote them, where `values` have been converted.
+        values: (N,) intensities as the driver wrote them. NaN, infinite and negative values do not
+            count, nor does a share of MAX_OUTLIERS.
+        dtype: type in which the driver wrote them, if `values` have been converted.
     """
     kind = np.dtype(values.dtype if dtype is None else dtype)
     if kind.kind in "iu" and kind.itemsize == 1:
@@ -39,15 +39,15 @@ def full_scale(values: np.ndarray, dtype: DTypeLike | None = None) -> float:
     if kind.kind not in "iu":
         if not _exceeds(values, MAX_UNIT):
             return 1.0
-        some = values[::max(1, len(values) // WHOLE_SAMPLE)]
-        some = some[np.isfinite(some)]
-        if (some != np.round(some)).any() and not _exceeds(values, PERCENT * TOLERANCE):
+        sample = values[::max(1, len(values) // WHOLE_SAMPLE)]
+        sample = sample[np.isfinite(sample)]
+        if (sample != np.round(sample)).any() and not _exceeds(values, PERCENT * TOLERANCE):
             return PERCENT
     return next((full for full in BITS if not _exceeds(values, full * TOLERANCE)), BITS[-1])
 
 
 def _exceeds(values: np.ndarray, limit: float) -> bool:
-    """Return True where more than MAX_OUTLIERS of the values are finite and above the limit."""
+    """Return True if more than a share of MAX_OUTLIERS is finite and above the limit."""
     if np.fmax.reduce(values, initial=0) <= limit:
         return False
     beyond = np.count_nonzero((values > limit) & (values < np.inf))
@@ -55,9 +55,11 @@ def _exceeds(values: np.ndarray, limit: float) -> bool:
 
 
 def to_unit(values: np.ndarray, full: float) -> np.ndarray:
-    """(N,) float32: intensities divided by the value of a full reflection, so 0..1. NaN, infinite
-    and negative ones become 0. Values above `full` stay above 1, so that scale_problem sees
-    them."""
+    """Divide intensities by the value of a full reflection; return (N,) float32, 0..1.
+
+    NaN, infinite and negative values become 0. Values above `full` stay above 1, so that
+    find_scale_problem can report them.
+    """
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes inf
         values = np.asarray(values, np.float32)
     valid = (values >= 0) & (values < np.inf)
@@ -67,29 +69,30 @@ def to_unit(values: np.ndarray, full: float) -> np.ndarray:
 
 
 class StreamScale:
-    """full_scale() of the clouds of one stream: the largest scale that any of them has had, so
-    that a dark cloud between others is not read in another scale. `full` is 0 before the first
-    cloud."""
+    """Scale of a stream of clouds: the largest that infer_full_scale() found for any of them.
+
+    A single dark cloud is therefore not read in another scale. `full` is 0 before the first cloud.
+    """
 
     def __init__(self) -> None:
         self.full = 0.0
 
     def __call__(self, values: np.ndarray, dtype: DTypeLike | None = None) -> float:
-        """Return the scale of the stream, after this cloud; arguments as of full_scale."""
-        self.full = max(self.full, full_scale(values, dtype))
+        """Return the scale of the stream including this cloud; arguments of infer_full_scale."""
+        self.full = max(self.full, infer_full_scale(values, dtype))
         return self.full
 
 
-def scale_problem(intensity: np.ndarray | None, factor: float = 1.0) -> str | None:
-    """Say what is wrong with the scale of intensities (N,) that should be 0..1, with the remedy;
-    None where nothing is, or where there is no intensity.
+def find_scale_problem(intensity: np.ndarray | None, factor: float = 1.0) -> str | None:
+    """Describe a wrong scale of intensities (N,) that should be 0..1, with the remedy.
 
-    factor: by which the reader multiplies them, as `fused.intensity_scale` does.
+    None if the scale is right or there is no intensity. factor is a parameter by which the reader
+    multiplies intensities, such as `fused.intensity_scale`.
     """
     if intensity is None or factor == 0.0:
         return None
     greatest = float(np.fmax.reduce(intensity, initial=0)) * factor
-    inferred = guessed_scale(intensity, factor)
+    inferred = guess_scale(intensity, factor)
     if inferred == 1.0 and (greatest == 0.0 or greatest >= MIN_BRIGHT
                             or len(intensity) < MIN_POINTS):
         return None
@@ -99,9 +102,11 @@ def scale_problem(intensity: np.ndarray | None, factor: float = 1.0) -> str | No
             "full reflection (1, 100 or 255 for most drivers; setup measures it)")
 
 
-def guessed_scale(intensity: np.ndarray, factor: float = 1.0) -> float:
-    """Return the full_scale() of intensities (N,) that should be 0..1 and are multiplied by factor;
-    1 where they are in 0..1, with or without the factor."""
+def guess_scale(intensity: np.ndarray, factor: float = 1.0) -> float:
+    """Return infer_full_scale() of intensities (N,) that should be 0..1.
+
+    1 if they are in 0..1 with or without multiplication by factor.
+    """
     if not _exceeds(intensity, MAX_UNIT) or not _exceeds(intensity, MAX_UNIT / max(factor, 1e-9)):
         return 1.0
-    return full_scale(intensity)
+    return infer_full_scale(intensity)

@@ -1,7 +1,7 @@
-"""How a number is declared: a dataclass field with unit, range and text, checked when made.
+"""Declaration of parameters: dataclass fields with unit, range and text, checked on construction.
 
-params.py holds the numbers themselves. A group may hold further groups; their fields have dotted
-names, such as ground.cloth.resolution.
+The params.py of each room declare the parameters. A group may hold further groups, whose fields
+have dotted names, such as ground.cloth.resolution.
 """
 
 from __future__ import annotations
@@ -17,17 +17,20 @@ from typing import Any
 from lidar_perception.types import did_you_mean, valid_names
 
 MAX_INT = 2**31 - 1
-SHOWN = reprlib.Repr()  # of a value that is refused, as much as fits into a line
-SHOWN.maxstring = SHOWN.maxother = SHOWN.maxlong = 80
-SHOWN.maxlevel = 2
+SHORT_REPR = reprlib.Repr()  # shows refused values in one line
+SHORT_REPR.maxstring = SHORT_REPR.maxother = SHORT_REPR.maxlong = 80
+SHORT_REPR.maxlevel = 2
 
 
 def param(default: Any, doc: str, *, unit: str = "", low: float | None = None,
           high: float | None = None, choices: tuple[str, ...] = (), fixed: bool = False) -> Any:
-    """A dataclass field with what ROS, YAML, the command line and the docs need to know.
+    """Declare a parameter: a dataclass field with metadata for ROS, YAML, command line and docs.
 
-    low and high are inclusive; fixed parameters cannot change while a node runs. A default of
-    type `type` stands for an empty list of it.
+    Args:
+        default: a type stands for an empty list of that type.
+        doc: description, one or more sentences.
+        low, high: inclusive limits.
+        fixed: True if the parameter cannot change while a node runs.
     """
     item = default if isinstance(default, type) else type(default[0]) if isinstance(
         default, tuple) else None
@@ -39,38 +42,38 @@ def param(default: Any, doc: str, *, unit: str = "", low: float | None = None,
 
 @dataclasses.dataclass(frozen=True)
 class Params:
-    """Base of all parameter groups: checks types and ranges on construction."""
+    """Base class of all parameter groups: checks types and ranges on construction."""
 
     def __post_init__(self) -> None:
         for f in fields(self):
             if not isinstance(f.default, Params):
-                object.__setattr__(self, f.name, _checked(f, getattr(self, f.name)))
+                object.__setattr__(self, f.name, _check_value(f, getattr(self, f.name)))
         self.check()
 
     def check(self) -> None:
-        """Conditions between fields; raise ValueError."""
+        """Check conditions between fields; raise ValueError if one does not hold."""
 
 
-def _checked(f: dataclasses.Field[Any], value: Any) -> Any:
-    """value with the type of the field's default, or ValueError naming field, value and range."""
+def _check_value(f: dataclasses.Field[Any], value: Any) -> Any:
+    """Return the value in the type of the field's default, or raise ValueError."""
     default, limits = f.default, f.metadata
     if isinstance(default, tuple):
         if isinstance(value, str) or not hasattr(value, "__iter__"):
-            raise ValueError(f"{f.name} = {SHOWN.repr(value)} must be a list of "
+            raise ValueError(f"{f.name} = {SHORT_REPR.repr(value)} must be a list of "
                              f"{limits['item'].__name__}")
-        return tuple(_scalar(f, limits["item"], item) for item in value)
-    value = _scalar(f, type(default), value)
+        return tuple(_check_scalar(f, limits["item"], item) for item in value)
+    value = _check_scalar(f, type(default), value)
     if limits["choices"] and value not in limits["choices"]:
         raise ValueError(f"{f.name} = {value!r} must be one of {', '.join(limits['choices'])}"
                          + did_you_mean(value, limits["choices"]))
     return value
 
 
-def _scalar(f: dataclasses.Field[Any], kind: type[Any], value: Any) -> Any:
+def _check_scalar(f: dataclasses.Field[Any], kind: type[Any], value: Any) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) < 2**63 else math.inf if value > 0 else -math.inf
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise ValueError(f"{f.name} = {SHOWN.repr(value)} must be of type {kind.__name__}")
+        raise ValueError(f"{f.name} = {SHORT_REPR.repr(value)} must be of type {kind.__name__}")
     low, high = f.metadata["low"], f.metadata["high"]
     if kind is float and math.isnan(value):
         raise ValueError(f"{f.name} is not a number (NaN)")
@@ -81,25 +84,28 @@ def _scalar(f: dataclasses.Field[Any], kind: type[Any], value: Any) -> Any:
     return value
 
 
-def _walk(params: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:
-    """(dotted name, value, field) of every number in a group, or a dataclass of groups."""
+def _walk_fields(params: Any,
+                 prefix: str = "") -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:
+    """Yield (dotted name, value, field) of every parameter of a group or a dataclass of groups."""
     for f in fields(params):
         value = getattr(params, f.name)
         if dataclasses.is_dataclass(value):
-            yield from _walk(value, f"{prefix}{f.name}.")
+            yield from _walk_fields(value, f"{prefix}{f.name}.")
         else:
             yield prefix + f.name, value, f
 
 
 def flatten(params: Any) -> dict[str, Any]:
-    """{'clustering.dbscan.eps': (0.15, 0.3, 0.5), ...} of a group or a dataclass of groups."""
-    return {name: value for name, value, _ in _walk(params)}
+    """Return the parameters of a group, or a dataclass of groups, by dotted name.
+
+    Example: {'clustering.dbscan.eps': (0.15, 0.3, 0.5), ...}.
+    """
+    return {name: value for name, value, _ in _walk_fields(params)}
 
 
-def parameter_fields(params: Any) -> dict[str, dataclasses.Field[Any]]:
-    """{'clustering.dbscan.eps': Field, ...}: metadata, and params' values as defaults, named as in
-    flatten."""
-    return {name: _with_default(f, value) for name, value, f in _walk(params)}
+def collect_fields(params: Any) -> dict[str, dataclasses.Field[Any]]:
+    """Return the fields of all parameters by dotted name, with the values of params as defaults."""
+    return {name: _with_default(f, value) for name, value, f in _walk_fields(params)}
 
 
 def _with_default(f: dataclasses.Field[Any], value: Any) -> dataclasses.Field[Any]:
@@ -110,7 +116,7 @@ def _with_default(f: dataclasses.Field[Any], value: Any) -> dataclasses.Field[An
     return changed
 
 
-def described(fields: Mapping[str, dataclasses.Field[Any]]) -> list[str]:
+def describe_fields(fields: Mapping[str, dataclasses.Field[Any]]) -> list[str]:
     """Return lines with name, default, unit and text of each field."""
     lines = []
     for name, f in fields.items():
@@ -121,25 +127,28 @@ def described(fields: Mapping[str, dataclasses.Field[Any]]) -> list[str]:
 
 
 def with_values(params: Any, values: Mapping[str, Any]) -> Any:
-    """params with {'clustering.dbscan.min_samples': 5, ...} set; ValueError names what is unknown
-    or wrong."""
-    known = parameter_fields(params)
+    """Return params with values replaced by dotted name, as {'clustering.dbscan.min_samples': 5}.
+
+    Raises:
+        ValueError: naming an unknown parameter or a wrong value.
+    """
+    known = collect_fields(params)
     if unknown := [name for name in values if name not in known]:
         raise ValueError(f"unknown parameter {unknown[0]!r}{valid_names(unknown[0], known)}")
-    return _replaced(params, values, "")
+    return _replace_values(params, values, "")
 
 
-def _replaced(params: Any, values: Mapping[str, Any], prefix: str) -> Any:
-    """params with those of the dotted values set that lie under prefix."""
+def _replace_values(params: Any, values: Mapping[str, Any], prefix: str) -> Any:
+    """Return params with the values replaced whose dotted name begins with prefix."""
     changed = {}
     for f in fields(params):
         inner, name = getattr(params, f.name), prefix + f.name
         if dataclasses.is_dataclass(inner):
-            changed[f.name] = _replaced(inner, values, f"{name}.")
+            changed[f.name] = _replace_values(inner, values, f"{name}.")
         elif name in values:
             changed[f.name] = values[name]
     try:
         return dataclasses.replace(params, **changed)
     except ValueError as error:
-        # Errors of inner groups have their whole name already.
+        # Errors of inner groups already have the full name.
         raise ValueError(f"{prefix}{error}") from None

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.geometry import wrap_angle, wrap_line
-from lidar_perception.robot.poses import inverse, moved_boxes
+from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_studio.state import INTERPOLATED, KEY, PROPOSED, Box
 
 Array = np.ndarray[Any, Any]
@@ -39,11 +39,12 @@ class Motion:
     def fixed(self, values: Array | tuple[float, ...], frame: int) -> Array:
         """(7,) a box of a frame in the fixed frame."""
         box = np.asarray(values, np.float64)
-        return box if self.poses is None else moved_boxes(box, self.poses[frame])[0]
+        return box if self.poses is None else transform_boxes(box, self.poses[frame])[0]
 
     def seen(self, box: Array, frame: int) -> Array:
         """The inverse of fixed."""
-        return box if self.poses is None else moved_boxes(box, inverse(self.poses[frame]))[0]
+        return box if self.poses is None else transform_boxes(
+            box, invert_pose(self.poses[frame]))[0]
 
     def carried(self, values: Array | tuple[float, ...], frm: int, to: int) -> Array:
         """(7,) a box of one frame as it is in another if it stands."""

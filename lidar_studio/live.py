@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.intensity import StreamScale
-from lidar_perception.robot.poses import moved_boxes, moved_points
-from lidar_perception.robot.tree import Missing, TransformTree
+from lidar_perception.robot.poses import transform_boxes, transform_points
+from lidar_perception.robot.transform_tree import MissingTransform, TransformTree
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import to_truth
 from lidar_perception.wire.track_markers import read_trails
@@ -168,14 +168,14 @@ class Live:
         if objects.frame_id.lstrip("/") not in ("", own.lstrip("/")):
             try:
                 pose = self.tree.lookup(own, objects.frame_id, frame.stamp_ns)
-            except Missing as error:
+            except MissingTransform as error:
                 if error.late and monotonic() - frame.came <= PATIENCE:
                     self._unplaced.append((frame, topic, objects, message))
                 else:
                     heard.elsewhere = str(error)
                 return
-            objects = replace(objects, boxes=moved_boxes(objects.boxes, pose))
-            trails = {number: moved_points(trail, pose) for number, trail in trails.items()}
+            objects = replace(objects, boxes=transform_boxes(objects.boxes, pose))
+            trails = {number: transform_points(trail, pose) for number, trail in trails.items()}
         heard.elsewhere = ""
         frame.objects[topic] = objects
         frame.trails[topic] = {track_id(heard.number, n): trail for n, trail in trails.items()}

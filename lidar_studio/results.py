@@ -21,7 +21,7 @@ from lidar_perception.data.kitti.results import read_results, result_calibration
 from lidar_perception.data.to_bag import MARKERS
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.geometry import bev_iou
-from lidar_perception.intensity import full_scale
+from lidar_perception.intensity import infer_full_scale
 from lidar_perception.runs.terminal import errors
 from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, one_to_one
 from lidar_perception.scoring.recorded import by_stamp
@@ -229,7 +229,7 @@ def recorded_scan(frame: Frame) -> Scan:
     return scan_in(message, frame.intensity_max()) if both else scanned(frame)
 
 
-def scan_in(message: Any, intensity_max: float = 0.0, scale: FullScale = full_scale) -> Scan:
+def scan_in(message: Any, intensity_max: float = 0.0, scale: FullScale = infer_full_scale) -> Scan:
     """Return a PointCloud2 with the ground and clusters that it has; none where it has no such
     column. intensity_max, scale: see to_frame. InputError where it is broken."""
     cloud, indices = to_frame(message, intensity_max, scale)

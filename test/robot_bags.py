@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.data.frame import POSES
 from lidar_perception.data.open import open_recording
-from lidar_perception.robot.placing import tilted
+from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_odometry
@@ -15,7 +15,8 @@ from lidar_perception.wire.transforms import ODOMETRY_MESSAGE, TF_MESSAGE
 from msg_utils.stamps import SECOND, header_message
 
 START, CLOUDS = 1_700_000_000 * SECOND, 5
-ON_BASE = tilted(0.02, -0.05, 1.1)  # the sensor in base_link: leaning, and turned to the left
+ON_BASE = make_tilted_pose(0.02, -0.05,
+                           1.1)  # the sensor in base_link: leaning, and turned to the left
 ON_BASE[:3, :3] = ON_BASE[:3, :3] @ Rotation.from_euler("z", 90, degrees=True).as_matrix()
 ON_BASE[0, 3] = 0.4
 
@@ -60,7 +61,8 @@ def moving_tf(seconds=CLOUDS / 10):
     """map -> odom -> base_link every 20 ms; the map jumps."""
     for i in range(-2, round(50 * seconds) + 1):
         stamp = START + i * SECOND // 50
-        yield TF, TF_MESSAGE, stamp, tf(transform("map", "odom", stamp, tilted(0, 0, i % 2)),
+        yield TF, TF_MESSAGE, stamp, tf(transform("map", "odom", stamp,
+                                                  make_tilted_pose(0, 0, i % 2)),
                                         transform("odom", "base_link", stamp, base_at(stamp)))
 
 

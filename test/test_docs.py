@@ -11,7 +11,7 @@ import pytest
 from lidar_perception.nodes import NODES, load_node_class
 from lidar_perception.nodes.known import node_parameters
 from lidar_perception.nodes.main import help_text
-from lidar_perception.param_fields import parameter_fields
+from lidar_perception.param_fields import collect_fields
 
 pytestmark = pytest.mark.no_cover  # others run these lines
 
@@ -30,7 +30,7 @@ def generate():
 def test_help_of_a_node_names_every_parameter(generate, name):
     text = help_text(name)
     assert all(f"  {key} (" in text for key in node_parameters(name))
-    assert parameter_fields(generate.PAGES[name]["params"]).keys() <= node_parameters(name).keys()
+    assert collect_fields(generate.PAGES[name]["params"]).keys() <= node_parameters(name).keys()
 
 
 def test_every_node_has_a_page():
@@ -100,7 +100,7 @@ def test_the_nodes_before_a_detector_get_its_numbers(generate, network):
     values = read_config(file, PipelineParams())
     detector = generate.PAGES[f"{network}_detector"]["params"]
     for params in GroundNodeParams(), ClusteringNodeParams():
-        known = parameter_fields(params)
+        known = collect_fields(params)
         own = with_values(params, {k: v for k, v in values.items() if k in known})
         for group in ("input", "ground", "clustering"):
             assert getattr(own, group, None) in (None, getattr(detector, group))

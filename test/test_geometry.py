@@ -1,4 +1,4 @@
-"""Laws of boxes, angles, ranges, usable returns and the camera's view."""
+"""Laws of boxes, angles, ranges, usable returns and the view of a camera."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from lidar_perception.camera import Camera
 from lidar_perception.geometry import (
     box_corners,
     horizontal_range,
+    is_within,
     points_in_box,
     to_box_frame,
-    within,
     wrap_angle,
     wrap_line,
 )
@@ -26,42 +26,42 @@ places = st.floats(-80, 80)
 sizes = st.floats(0.01, 20)
 some_boxes = st.tuples(places, places, places, sizes, sizes, sizes, angles).map(np.array)
 
-# Front left, rear left, rear right, front right, seen from above: counter-clockwise.
+# Front left, rear left, rear right, front right: counter-clockwise seen from above.
 SIGNS = np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1],
                   [1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]]) / 2
 
 
 @given(seeds)
-def test_within_is_half_open_and_holds_nothing_that_is_nan(seed):
+def test_is_within_is_half_open_and_false_for_nan(seed):
     at = np.random.default_rng(seed).integers(-3, 4, (40, 7)).astype(np.float32)
     at[::5, :2] = np.nan
     low, high = (-1.0, -2.0, 5.0), (2.0, 1.0, 5.0)
     expected = [low[0] <= x < high[0] and low[1] <= y < high[1] for x, y in at[:, :2].tolist()]
-    assert within(at, low, high).tolist() == expected
-    assert within(at[:0], low, high).shape == (0,)
+    assert is_within(at, low, high).tolist() == expected
+    assert is_within(at[:0], low, high).shape == (0,)
 
 
 @given(some_boxes)
-def test_the_corners_in_the_box_frame_are_half_the_size_away_in_order(box):
+def test_corners_in_the_box_frame_are_half_the_size(box):
     corners = box_corners(box[None])[0]
     np.testing.assert_allclose(to_box_frame(corners, box), SIGNS * box[3:6], rtol=0, atol=1e-10)
 
 
 @given(some_boxes, seeds)
-def test_the_box_frame_is_the_inverse_of_placing_points_there(box, seed):
+def test_to_box_frame_inverts_a_rotation_and_translation(box, seed):
     local = np.random.default_rng(seed).uniform(-9, 9, (20, 3))
     placed = Rotation.from_euler("z", box[6]).apply(local) + box[:3]
     np.testing.assert_allclose(to_box_frame(placed, box), local, rtol=0, atol=1e-10)
 
 
-def test_corners_of_many_boxes_are_those_of_each_and_none_have_none():
+def test_corners_of_many_boxes_equal_those_of_each():
     many = np.random.default_rng(0).uniform(0.1, 5, (7, 7))
     np.testing.assert_allclose(box_corners(many), [box_corners(b[None])[0] for b in many])
     assert box_corners(np.zeros((0, 7))).shape == (0, 8, 3)
 
 
 @given(some_boxes, seeds, st.floats(-0.5, 3))
-def test_points_in_box_is_the_slow_reading(box, seed, margin):
+def test_points_in_box_equals_a_plain_implementation(box, seed, margin):
     rng = np.random.default_rng(seed)
     reach = np.hypot(*box[3:5]) + abs(margin) + 0.1
     xyz = (box[:3] + rng.uniform(-reach, reach, (200, 3))).astype(np.float32)
@@ -79,7 +79,7 @@ def test_points_in_box_is_the_slow_reading(box, seed, margin):
 
 @given(st.integers(-40, 40), st.integers(-40, 40), st.sampled_from([0.0, np.pi]),
        st.sampled_from([0.0, 0.5, 2.0]))
-def test_points_on_the_faces_count_and_those_just_outside_do_not(x, y, yaw, margin):
+def test_points_on_the_faces_are_inside(x, y, yaw, margin):
     box = np.array([x / 4, y / 4, 1.0, 2.0, 1.0, 1.5, 0.0])
     half = box[3:6] / 2 + margin
     for axis in range(3):
@@ -90,14 +90,14 @@ def test_points_on_the_faces_count_and_those_just_outside_do_not(x, y, yaw, marg
             beyond[axis] += sign * 1e-3
             inward = face.copy()
             inward[axis] -= sign * 1e-3
-            turned = np.array([*box[:6], yaw])
+            rotated = np.array([*box[:6], yaw])
             points = np.float32([face, beyond, inward])
             assert points_in_box(points, box, margin).tolist() == [True, False, True]
-            assert points_in_box(points, turned, margin)[1:].tolist() == [False, True]
+            assert points_in_box(points, rotated, margin)[1:].tolist() == [False, True]
 
 
 @given(some_boxes, seeds)
-def test_half_a_turn_of_the_box_keeps_its_points_and_a_quarter_swaps_its_sides(box, seed):
+def test_half_and_quarter_turns_of_a_box_keep_its_points(box, seed):
     rng = np.random.default_rng(seed)
     xyz = box[:3] + rng.uniform(-12, 12, (300, 3))
     assume((np.abs(np.abs(to_box_frame(xyz, box)) - box[3:6] / 2) > 1e-6).all())
@@ -108,14 +108,14 @@ def test_half_a_turn_of_the_box_keeps_its_points_and_a_quarter_swaps_its_sides(b
     np.testing.assert_array_equal(points_in_box(xyz, quarter), inside)
 
 
-def test_no_points_are_in_a_box_and_none_in_one_of_negative_size():
+def test_points_in_box_of_no_points_or_negative_size():
     box = np.array([1, 2, 3, 1, 1, 1, 0.5])
     assert points_in_box(np.zeros((0, 3), np.float32), box).shape == (0,)
     assert not points_in_box(np.float32([[1, 2, 3]]), box, margin=-0.6).any()
 
 
 @given(st.floats(-1e4, 1e4))
-def test_wrap_angle_is_the_same_angle_in_the_half_open_interval(angle):
+def test_wrapped_angles_are_equal_and_in_the_interval(angle):
     wrapped = wrap_angle(angle)
     assert -np.pi <= wrapped < np.pi
     turns = (angle - wrapped) / (2 * np.pi)
@@ -126,7 +126,7 @@ def test_wrap_angle_is_the_same_angle_in_the_half_open_interval(angle):
     assert abs(half_turns - round(half_turns)) < 1e-9
 
 
-def test_wrap_angle_at_its_ends():
+def test_wrap_angle_at_the_ends_of_the_interval():
     below = np.nextafter(-np.pi, -4)
     assert wrap_angle(np.array([np.pi, -np.pi, 3 * np.pi, 0.0])).tolist() == [
         -np.pi, -np.pi, -np.pi, 0.0]
@@ -134,7 +134,7 @@ def test_wrap_angle_at_its_ends():
 
 
 @given(seeds, st.sampled_from([np.float32, np.float64]))
-def test_horizontal_range_is_the_hypotenuse_and_knows_no_height_or_heading(seed, dtype):
+def test_horizontal_range_ignores_height_and_heading(seed, dtype):
     xyz = (np.random.default_rng(seed).normal(size=(50, 3)) * 40).astype(dtype)
     ranges = horizontal_range(xyz)
     assert ranges.dtype == dtype and ranges.shape == (50,)
@@ -152,13 +152,13 @@ def test_horizontal_range_is_the_hypotenuse_and_knows_no_height_or_heading(seed,
     ([1.001e5, 0, 0], False), ([8e4, 8e4, 0], False), ([0, 0, -1e20], False),
     ([3e38, 3e38, 3e38], False),
 ])
-def test_a_return_is_usable_if_it_is_finite_near_and_not_the_origin(point, usable, dtype):
+def test_usable_returns_are_finite_near_and_not_the_origin(point, usable, dtype):
     xyz = np.array([[1, 1, 1], point, [2, 2, 2]], dtype)
     found = usable_returns(xyz)
     assert found.dtype == bool and found.tolist() == [True, usable, True]
 
 
-def test_no_returns_are_usable_of_none_and_columns_may_lie_apart():
+def test_usable_returns_takes_strided_and_empty_arrays():
     assert usable_returns(np.zeros((0, 3), np.float32)).shape == (0,)
     wide = np.zeros((4, 6), np.float32)
     wide[2, 1] = 5
@@ -172,18 +172,19 @@ OPTICAL = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # camera to
 WIDTH, HEIGHT = 1242, 375
 
 
-def some_camera(rng):
-    """A camera like KITTI's, its pose in the LiDAR frame, and P."""
+def make_camera(rng):
+    """Return a camera like KITTI's, its rotation and translation in the LiDAR frame, and P."""
     p = np.array([[721.5, 0, 609.6, 44.9], [0, 721.5, 172.9, 0.2], [0, 0, 1, 0.003]])
     rotation = Rotation.from_rotvec(rng.normal(0, 0.05, 3)) * OPTICAL
     translation = np.array([0.27, 0, -0.08]) + rng.normal(0, 0.05, 3)
-    return Camera.of(p, rotation.as_quat(), translation, WIDTH, HEIGHT), rotation, translation, p
+    camera = Camera.from_camera_pose(p, rotation.as_quat(), translation, WIDTH, HEIGHT)
+    return camera, rotation, translation, p
 
 
 @given(seeds)
-def test_in_view_is_the_float64_projection_away_from_the_borders(seed):
+def test_in_view_equals_the_float64_projection(seed):
     rng = np.random.default_rng(seed)
-    camera, rotation, translation, p = some_camera(rng)
+    camera, rotation, translation, p = make_camera(rng)
     xyz = (rng.normal(size=(2000, 3)) * [40, 20, 5]).astype(np.float32)
     in_camera = rotation.inv().apply(xyz.astype(np.float64) - translation)
     u, v, depth = p @ np.column_stack([in_camera, np.ones(len(xyz))]).T
@@ -196,21 +197,22 @@ def test_in_view_is_the_float64_projection_away_from_the_borders(seed):
 
 
 @given(seeds)
-def test_either_direction_of_the_pose_gives_the_same_camera(seed):
-    camera, rotation, translation, p = some_camera(np.random.default_rng(seed))
-    back = rotation.inv()
-    other = Camera.of_lidar_pose(p, back.as_quat(), -back.apply(translation), WIDTH, HEIGHT)
+def test_both_directions_of_the_pose_give_the_same_camera(seed):
+    camera, rotation, translation, p = make_camera(np.random.default_rng(seed))
+    inverse = rotation.inv()
+    other = Camera.from_lidar_pose(p, inverse.as_quat(), -inverse.apply(translation), WIDTH,
+                                   HEIGHT)
     np.testing.assert_allclose(other.projection, camera.projection, rtol=0, atol=1e-9)
 
 
-def test_the_image_includes_its_left_and_top_border_but_not_the_right_and_bottom():
+def test_the_image_includes_its_left_and_top_border_only():
     camera = Camera(np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]), 2, 1)  # u = -y / x
     xyz = np.float32([[4, 0, 0], [4, -8, 0], [4, -7.99, 0], [4, 0, -4], [4, 0, -3.99],
                       [4, 0.01, 0], [4, 0, 0.01]])
     assert camera.in_view(xyz).tolist() == [True, False, True, False, True, False, False]
 
 
-def test_what_is_behind_or_beside_the_camera_is_not_in_view():
+def test_points_behind_the_camera_are_not_in_view():
     camera = Camera(np.array([[10, -1, 0, 0], [10, 0, -1, 0], [1, 0, 0, 0.0]]), 20, 20)
     ahead = np.float32([[5, 0, 0]])
     assert camera.in_view(ahead).tolist() == [True]

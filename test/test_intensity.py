@@ -1,4 +1,4 @@
-"""The scale of intensities, and arrays in the place of a LidarFrame."""
+"""Scale of intensities, and arrays in place of a LidarFrame."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from lidar_perception.ground.params import GroundParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.intensity import (
     StreamScale,
-    full_scale,
-    guessed_scale,
-    scale_problem,
+    find_scale_problem,
+    guess_scale,
+    infer_full_scale,
     to_unit,
 )
 from lidar_perception.nodes.sensor_check import SensorCheck
@@ -42,20 +42,20 @@ WHOLE = {full: np.round(UNIT * full) for full in (100, 255, 1023, 4095, 65535)}
     ([np.nan, np.inf, -5, 0.5], "f4", 1), ([np.nan] * 3, "f4", 1), (-UNIT, "f4", 1)])
 def test_full_scale_follows_values_and_type(values, kind, full):
     values = np.asarray(values)
-    assert full_scale(values.astype(kind)) == full
+    assert infer_full_scale(values.astype(kind)) == full
     if np.isfinite(values).all():
-        assert full_scale(values.astype(kind).astype(np.float32), kind) == full
+        assert infer_full_scale(values.astype(kind).astype(np.float32), kind) == full
 
 
 def test_a_few_broken_values_do_not_change_the_scale():
     many = np.tile(UNIT, 10)
     many[:2] = 1e30, 40000.0
-    assert full_scale(many) == 1.0 and scale_problem(many) is None
+    assert infer_full_scale(many) == 1.0 and find_scale_problem(many) is None
     many[:30] = 255.0
-    assert full_scale(many) == 255.0
+    assert infer_full_scale(many) == 255.0
 
 
-def test_to_unit_keeps_regular_values_bit_for_bit_and_reads_broken_ones_as_zero():
+def test_to_unit_keeps_regular_values_and_zeroes_invalid_ones():
     assert to_unit(UNIT, 1.0).tobytes() == UNIT.tobytes()
     odd = to_unit(np.array([np.nan, np.inf, -np.inf, -3, 1e300, 0, 51, 510]), 255)
     assert odd.dtype == np.float32 and np.allclose(odd, [0, 0, 0, 0, 0, 0, 0.2, 2])
@@ -69,13 +69,13 @@ def test_the_scale_of_a_stream_never_falls(order):
     assert found == sorted(found) and scale.full == 255.0
 
 
-def test_a_node_reads_dark_clouds_in_the_scale_of_those_before():
-    """And one whose driver writes another scale does not change the scale of another node."""
+def test_a_node_reads_dark_clouds_in_the_scale_of_its_stream():
+    """The scale of one node does not affect another node."""
     def message(values, stamp):
         return cloud_message(np.column_stack([np.ones((len(values), 3)), values]), stamp)
 
     params = SimpleNamespace(input=InputParams(), crop=CropParams(), ground=GroundParams())
-    placing = SimpleNamespace(levelled=lambda frame: frame)
+    placing = SimpleNamespace(level_frame=lambda frame: frame)
     transforms = SimpleNamespace(placing=lambda header: placing,
                                  mounted=lambda params, placing: params)
     node = SimpleNamespace(params=params, transforms=transforms, counts={})
@@ -87,27 +87,27 @@ def test_a_node_reads_dark_clouds_in_the_scale_of_those_before():
     assert np.array_equal(other.frame(message(dark, 2), True)[0].intensity, dark)
     node.params.input = InputParams(intensity_max=2.0)
     assert np.array_equal(check.frame(message(dark, 3), True)[0].intensity, dark / 2)
-    assert check.frame(message(dark, 4))[0].intensity is None  # nobody reads it
+    assert check.frame(message(dark, 4))[0].intensity is None  # no reader
 
 
 @pytest.mark.parametrize("full", [100, 255, 1023, 4095, 65535])
-def test_another_scale_is_said_with_the_remedy(full):
+def test_a_wrong_scale_is_reported_with_the_remedy(full):
     values = UNIT * np.float32(full)
-    assert guessed_scale(values) == full
-    problem = scale_problem(values)
+    assert guess_scale(values) == full
+    problem = find_scale_problem(values)
     assert "input.intensity_max" in problem and f"divided by {full}, a guess" in problem
     assert "LidarFrame.of" in problem and "\n" not in problem
-    for factor in (0.0, 1 / full):  # fused.intensity_scale leaves it out, or makes up for it
-        assert scale_problem(values, factor) is None and guessed_scale(values, factor) == 1.0
-    assert guessed_scale(values, 0.4) == full
+    for factor in (0.0, 1 / full):  # fused.intensity_scale ignores or corrects the intensity
+        assert find_scale_problem(values, factor) is None and guess_scale(values, factor) == 1.0
+    assert guess_scale(values, 0.4) == full
 
 
-def test_dark_intensities_are_said_and_regular_ones_are_not():
-    assert "goes up to 0.02 " in scale_problem(UNIT * np.float32(0.02))
-    assert scale_problem(UNIT[:100] * np.float32(0.02)) is None
-    assert scale_problem(UNIT * np.float32(0.02), 40.0) is None
+def test_dark_intensities_are_reported():
+    assert "goes up to 0.02 " in find_scale_problem(UNIT * np.float32(0.02))
+    assert find_scale_problem(UNIT[:100] * np.float32(0.02)) is None
+    assert find_scale_problem(UNIT * np.float32(0.02), 40.0) is None
     for fine in (None, UNIT, UNIT * 0, UNIT[:0], np.full(3000, 0.3)):
-        assert scale_problem(fine) is None
+        assert find_scale_problem(fine) is None
 
 
 # arrays
@@ -122,15 +122,15 @@ CLOUD = np.random.default_rng(1).uniform([2, -9, -2, 0], [30, 9, 1, 1], (400, 4)
     (np.ones((9, 3), bool), "ndarray of bool"), (np.ones((9, 3), complex), "complex"),
     (np.ones(9, [("x", "f4"), ("y", "f4")]), "ndarray of void"), ([[1, 2, 3], [1]], "as an array"),
     ("drive.bag", "is str"), (None, "is NoneType"), (7.0, r"shape \(\)")])
-def test_what_is_no_cloud_is_refused_at_every_door(points, remedy):
-    for door in (LidarFrame.of, segment_ground, cluster,
-                 lambda cloud: cluster_obstacles(cloud, np.zeros(9, bool))):
+def test_every_entry_point_refuses_invalid_clouds(points, remedy):
+    for function in (LidarFrame.of, segment_ground, cluster,
+                     lambda cloud: cluster_obstacles(cloud, np.zeros(9, bool))):
         with pytest.raises(InputError, match=f"a cloud .*{remedy}") as error:
-            door(points)
+            function(points)
         assert r"(N, 3) [x y z]" in str(error.value) and "\n" not in str(error.value)
 
 
-def test_clouds_of_three_and_four_columns_are_the_same_frame():
+def test_clouds_of_three_and_four_columns_give_equal_frames():
     plain = LidarFrame.of(CLOUD[:, :3])
     four = LidarFrame.of(CLOUD, stamp_ns=5, frame_id="velodyne")
     assert plain.intensity is None and (four.stamp_ns, four.frame_id) == (5, "velodyne")
@@ -146,7 +146,7 @@ def test_clouds_of_three_and_four_columns_are_the_same_frame():
         assert len(LidarFrame.of(empty)) == 0
 
 
-def test_the_scale_of_an_intensity_is_declared_or_known_by_its_type():
+def test_intensity_scale_is_declared_or_inferred_from_the_type():
     raw = (CLOUD[:, 3] * 255).astype(np.uint8)
     expected = raw / np.float32(255)
     xyz = CLOUD[:, :3]
@@ -169,7 +169,7 @@ def test_the_scale_of_an_intensity_is_declared_or_known_by_its_type():
 
 
 @pytest.mark.parametrize("method", ["threshold", "patchwork", "cloth"])
-def test_ground_of_an_array_is_that_of_its_frame(method):
+def test_ground_of_an_array_equals_that_of_its_frame(method):
     params = GroundParams(method=method)
     xyz = np.random.default_rng(2).uniform([3, -9, -1.75], [30, 9, -1.7], (2000, 3))
     cloud = np.column_stack([xyz, UNIT[:2000]]).astype(np.float32)
@@ -183,7 +183,7 @@ def test_ground_of_an_array_is_that_of_its_frame(method):
         [xyz, UNIT[:2000] * 255]), intensity_max=255), params))
 
 
-def test_clusters_of_an_array_are_those_of_its_frame():
+def test_clusters_of_an_array_equal_those_of_its_frame():
     ids = cluster(LidarFrame.of(CLOUD))
     assert np.array_equal(cluster(CLOUD), ids) and np.array_equal(cluster(CLOUD[:, :3]), ids)
     with pytest.raises(InputError, match="ground has 3 values for 400 points"):
@@ -204,7 +204,7 @@ def test_boxes_of_another_shape_are_refused(boxes, said):
         Detections.of(boxes)
 
 
-def test_a_tracker_names_what_it_takes():
+def test_error_of_the_tracker_names_the_expected_type():
     for wrong in (np.ones((2, 7)), None):
         with pytest.raises(InputError, match=rf"not {type(wrong).__name__}; give detector"):
             Tracker()(wrong)

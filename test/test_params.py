@@ -1,4 +1,4 @@
-"""Parameters: what is in range goes in and comes out; what is not is named."""
+"""Parameters: values in range are kept, others are refused by name."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lidar_perception.detectors.pointpillars import params as pointpillars_param
 from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.ground import params as ground_params
 from lidar_perception.ground.params import ThresholdParams
-from lidar_perception.param_fields import Params, flatten, parameter_fields, with_values
+from lidar_perception.param_fields import Params, collect_fields, flatten, with_values
 from lidar_perception.params import (
     ClusteringNodeParams,
     GroundNodeParams,
@@ -41,12 +41,12 @@ MODULES = (node_params, candidate_params, clustering_params, detector_params, gr
            training_params)
 
 
-def groups_below(base: type) -> list[type]:
-    return [group for kind in base.__subclasses__() for group in (kind, *groups_below(kind))]
+def find_groups(base: type) -> list[type]:
+    return [group for kind in base.__subclasses__() for group in (kind, *find_groups(kind))]
 
 
-GROUPS = [group for group in groups_below(Params)
-          if group.__module__ in [each.__name__ for each in MODULES]]
+GROUPS = [group for group in find_groups(Params)
+          if group.__module__ in [module.__name__ for module in MODULES]]
 COMPOSITES = [TrackerNodeParams, PipelineParams, GroundNodeParams,
               ClusteringNodeParams, RefinementNodeParams,
               DetectorParams, PointNetDetectorParams, PointPillarsTraining]
@@ -62,7 +62,7 @@ def kind_of(f: dataclasses.Field) -> type:
 
 
 def as_field(f: dataclasses.Field, value):
-    """value where the field is a scalar; a list as long as the default, with value first."""
+    """Return value for a scalar field; else a list as long as the default, with value first."""
     return (value, *f.default[1:]) if f.metadata["item"] else value
 
 
@@ -75,10 +75,10 @@ def step_of(f: dataclasses.Field) -> float:
 
 
 def other_value(f: dataclasses.Field):
-    """A value in range that is not the default."""
+    """Return a value in range that is not the default."""
     if f.metadata["choices"]:
         return next(c for c in f.metadata["choices"] if c != f.default)
-    if f.name in ("body", "sectors"):  # boxes and pairs; none by default
+    if f.name in ("body", "sectors"):  # a box, or pairs; empty by default
         return (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
     if f.metadata["item"]:
         return (*f.default, "/more") if kind_of(f) is str else tuple(v + 1.0 for v in f.default)
@@ -96,8 +96,8 @@ def config(tmp_path, text: str, params=None):
     return read_config(path, params or PipelineParams())
 
 
-def test_every_group_of_the_module_is_tested():
-    public = [v for each in MODULES for v in vars(each).values()
+def test_every_parameter_group_is_tested():
+    public = [v for module in MODULES for v in vars(module).values()
               if isinstance(v, type) and dataclasses.is_dataclass(v)
               and v.__module__ in [m.__name__ for m in MODULES]]
     assert {*public} == {*GROUPS, *COMPOSITES}
@@ -106,11 +106,11 @@ def test_every_group_of_the_module_is_tested():
 @each_params
 def test_defaults_pass_their_own_checks_unchanged(kind):
     made = kind()
-    assert flatten(made) == {n: f.default for n, f in parameter_fields(made).items()}
+    assert flatten(made) == {n: f.default for n, f in collect_fields(made).items()}
 
 
 @each_field
-def test_each_field_says_what_it_is(group, f):
+def test_each_field_is_documented(group, f):
     assert f.metadata["doc"].endswith(".")
     assert kind_of(f) in (bool, int, float, str)
     assert f.metadata["choices"] == () or f.default in f.metadata["choices"]
@@ -119,23 +119,23 @@ def test_each_field_says_what_it_is(group, f):
 @each_params
 def test_with_values_inverts_flatten(kind):
     changed = with_values(kind(), {n: other_value(f)
-                                   for n, f in parameter_fields(kind()).items()})
+                                   for n, f in collect_fields(kind()).items()})
     assert changed != kind()
     assert with_values(kind(), flatten(changed)) == changed
     assert flatten(with_values(kind(), flatten(changed))) == flatten(changed)
 
 
 @each_params
-def test_with_values_changes_nothing_else(kind):
-    for name, f in parameter_fields(kind()).items():
+def test_with_values_keeps_other_values(kind):
+    for name, f in collect_fields(kind()).items():
         if name.endswith(("eps", "range_limits")):
-            continue  # two lengths that depend on each other
+            continue  # their lengths depend on each other
         assert flatten(with_values(kind(), {name: other_value(f)})) == {
             **flatten(kind()), name: other_value(f)}
 
 
 @for_all(bounded("low"))
-def test_below_the_range_names_field_value_and_range(group, f):
+def test_error_below_the_range_names_field_and_range(group, f):
     value = f.metadata["low"] - step_of(f)
     with pytest.raises(ValueError) as error:
         group(**{f.name: as_field(f, value)})
@@ -144,7 +144,7 @@ def test_below_the_range_names_field_value_and_range(group, f):
 
 
 @for_all(bounded("high"))
-def test_above_the_range_names_field_value_and_range(group, f):
+def test_error_above_the_range_names_field_and_range(group, f):
     value = f.metadata["high"] + step_of(f)
     with pytest.raises(ValueError) as error:
         group(**{f.name: as_field(f, value)})
@@ -154,14 +154,14 @@ def test_above_the_range_names_field_value_and_range(group, f):
 
 @for_all([p for p in bounded("low") + bounded("high")
                                       if not p.values[1].metadata["item"]])
-def test_the_ends_of_the_range_belong_to_it(group, f):
+def test_range_includes_its_limits(group, f):
     for limit in (f.metadata["low"], f.metadata["high"]):
         if limit is not None:
             assert getattr(group(**{f.name: kind_of(f)(limit)}), f.name) == limit
 
 
 @each_field
-def test_wrong_types_name_field_value_and_type(group, f):
+def test_error_of_a_wrong_type_names_field_and_type(group, f):
     wrong = {bool: [1, 0.0, "true"], int: [1.0, "1", True], float: ["1.0", True, 1j],
              str: [1, 2.0, True]}[kind_of(f)]
     for value in [None, *wrong]:
@@ -172,20 +172,20 @@ def test_wrong_types_name_field_value_and_type(group, f):
 
 
 @for_all([p for p in FIELDS if p.values[1].metadata["item"]])
-def test_a_scalar_is_no_list(group, f):
+def test_a_scalar_for_a_list_is_refused(group, f):
     for value in ("text", 1.0, None):
         with pytest.raises(ValueError, match=f"^{f.name} = .*must be a list"):
             group(**{f.name: value})
 
 
 @for_all([p for p in FIELDS if kind_of(p.values[1]) is float])
-def test_nan_is_no_number(group, f):
+def test_nan_is_refused(group, f):
     with pytest.raises(ValueError, match=f"^{f.name} is not a number"):
         group(**{f.name: as_field(f, math.nan)})
 
 
 @for_all([p for p in FIELDS if p.values[1].metadata["choices"]])
-def test_what_is_not_a_choice_is_answered_with_the_choices(group, f):
+def test_error_of_a_wrong_choice_lists_the_choices(group, f):
     with pytest.raises(ValueError, match=f"^{f.name} = 'nothing'") as error:
         group(**{f.name: "nothing"})
     assert all(choice in str(error.value) for choice in f.metadata["choices"])
@@ -210,7 +210,7 @@ def test_dbscan_takes_any_number_of_bands(limits, eps):
     assert (made.range_limits, made.eps) == (limits, eps)
 
 
-def test_one_more_eps_than_range_limits():
+def test_eps_has_one_value_more_than_range_limits():
     for eps in [(), (0.1, 0.2), (0.1, 0.2, 0.3, 0.4)]:
         with pytest.raises(ValueError, match=f"eps has {len(eps)} values for 2 range_limits"):
             DbscanParams(eps=eps)
@@ -223,28 +223,28 @@ def test_range_limits_ascend(limits):
 
 
 @pytest.mark.parametrize("value", [10**400, -10**400, 2**63, float("inf")])
-def test_numbers_beyond_all_bounds_are_out_of_them(value):
-    """Ints of YAML may be larger than any float."""
+def test_huge_numbers_are_out_of_range(value):
+    """Integers in YAML may be larger than any float."""
     with pytest.raises(ValueError, match=r"eps = .* is outside"):
         DbscanParams(eps=[0.1, 0.2, value])
 
 
 @each_params
-def test_an_unknown_name_is_answered_with_the_known_ones(kind):
+def test_error_of_an_unknown_name_lists_the_names(kind):
     with pytest.raises(ValueError, match="unknown parameter 'nonsense'") as error:
         with_values(kind(), {"nonsense": 1})
-    assert all(name in str(error.value) for name in parameter_fields(kind()))
+    assert all(name in str(error.value) for name in collect_fields(kind()))
 
 
-def test_with_values_names_the_group():
+def test_error_of_with_values_names_the_group():
     with pytest.raises(ValueError, match=r"^clustering\.dbscan\.min_samples = 0 is outside"):
         with_values(PipelineParams(), {"clustering.dbscan.min_samples": 0})
 
 
 def test_a_node_declares_the_parameters_of_the_pipeline():
-    whole = parameter_fields(PipelineParams())
-    parts = [parameter_fields(kind()) for kind in (GroundNodeParams, ClusteringNodeParams,
-                                                   RefinementNodeParams)]
+    whole = collect_fields(PipelineParams())
+    parts = [collect_fields(kind()) for kind in (GroundNodeParams, ClusteringNodeParams,
+                                                 RefinementNodeParams)]
     assert {k: v for part in parts for k, v in part.items()} == whole
 
 
@@ -277,7 +277,7 @@ def test_every_parameter_can_come_from_a_config(tmp_path):
     assert with_values(PlayerParams(), config(tmp_path, text, PlayerParams())) == PlayerParams()
 
 
-def test_a_config_may_hold_what_other_nodes_need(tmp_path):
+def test_a_config_may_have_parameters_of_other_nodes(tmp_path):
     values = config(tmp_path, """
 player: {ros__parameters: {rate: 2.0}}
 clustering: {ros__parameters: {clustering.dbscan: {min_samples: 7}, use_sim_time: true}}
@@ -299,7 +299,7 @@ def test_an_empty_config_sets_nothing(tmp_path):
     ("- perception\n", ("no parameter file",)),
     ("perception", ("no parameter file",)),
 ])
-def test_a_config_that_is_none_is_named_in_one_line(tmp_path, text, words):
+def test_error_of_an_invalid_config_names_the_file(tmp_path, text, words):
     with pytest.raises(InputError) as error:
         config(tmp_path, text)
     message = str(error.value)
@@ -307,7 +307,7 @@ def test_a_config_that_is_none_is_named_in_one_line(tmp_path, text, words):
     assert all(word in message for word in words)
 
 
-def test_a_config_that_cannot_be_read_is_named(tmp_path):
+def test_error_of_an_unreadable_config_names_the_file(tmp_path):
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00a")
     for name in ("missing.yaml", "binary.yaml", "."):
         with pytest.raises(InputError, match="cannot read the parameter file"):

@@ -25,7 +25,7 @@ from lidar_perception.candidates.segmented_cloud import (
 )
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.ground.segment import crop_with_sensor_pose, segment_ground
-from lidar_perception.groups import renumbered
+from lidar_perception.groups import renumber_ids
 from lidar_perception.types import LidarFrame, as_frame, check_columns
 
 
@@ -56,7 +56,7 @@ def segment_cloud(cloud: LidarFrame | ArrayLike, camera: Camera | None = None,
     if cluster_ids is None:
         cluster_ids = cluster_obstacles(seen.xyz, ground, params.clustering)
     else:
-        cluster_ids, numbers = renumbered(np.asarray(cluster_ids)[indices])
+        cluster_ids, numbers = renumber_ids(np.asarray(cluster_ids)[indices])
     t3 = perf_counter()
     boxes = fit_grounded_boxes(seen.xyz, ground, cluster_ids, params.boxes.shape)
     t4 = perf_counter()

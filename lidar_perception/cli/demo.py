@@ -37,7 +37,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.contract import FUSED
 from lidar_perception.detectors.open import DetectorChoice
-from lidar_perception.groups import renumbered
+from lidar_perception.groups import renumber_ids
 from lidar_perception.nodes import require_rclpy
 from lidar_perception.nodes.graph import ALONE, FINAL, cloud_topic, result_topics
 from lidar_perception.runs.files import write_text
@@ -268,7 +268,7 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
     ids = read_column(drawing, "cluster_id", indices)
     none = np.zeros(len(frame), int)
     colors = None if ground is None else by_cluster(
-        ground > 0, none if ids is None else renumbered(ids)[0])
+        ground > 0, none if ids is None else renumber_ids(ids)[0])
     boxes = Boxes(found.boxes, np.array(class_ids(found.labels), int),
                   [str(i) if trails else "" for i in found.ids],
                   [trails.get(int(i), found.boxes[k:k + 1, :3]) for k, i in enumerate(found.ids)])

@@ -23,7 +23,7 @@ from lidar_perception.detectors.open import DetectorChoice, default_params
 from lidar_perception.detectors.params import RANGE_CHOICES
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.known import node_parameters
-from lidar_perception.param_fields import described, parameter_fields, with_values
+from lidar_perception.param_fields import collect_fields, describe_fields, with_values
 from lidar_perception.runs.terminal import errors
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import InputError, did_you_mean
@@ -132,7 +132,7 @@ class SetOption(HelpfulOption):
 
     def listing(self, given: Mapping[str, Any]) -> str:
         return "\n".join(line for each in self.runs(given) for line in (
-            f"Parameters of {each.name}:", *described(each.fields)))
+            f"Parameters of {each.name}:", *describe_fields(each.fields)))
 
     def instead_of(self, flag: str) -> str:
         plain = flag.removeprefix("--").removeprefix("no-")
@@ -169,7 +169,7 @@ def settings_options(runs: Callable[[Mapping[str, Any]], list[Runs]],
 
 def candidates_run(on_messages: bool = False) -> Runs:
     """The pipeline of the STM-CPA paper; on_messages: in nodes."""
-    return Runs(CANDIDATES, _read_here(parameter_fields(PAPER), on_messages), CANDIDATE_NODES)
+    return Runs(CANDIDATES, _read_here(collect_fields(PAPER), on_messages), CANDIDATE_NODES)
 
 
 def parameter_options(defaults: Any, name: str = CANDIDATES,
@@ -177,7 +177,7 @@ def parameter_options(defaults: Any, name: str = CANDIDATES,
                       example: str = "stm.threshold=0.5") -> Callable:
     """Decorator: --config and --set of one dataclass of parameters, which the function gets as
     params=."""
-    runs = Runs(name, _read_here(parameter_fields(defaults), on_messages=False), nodes)
+    runs = Runs(name, _read_here(collect_fields(defaults), on_messages=False), nodes)
 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
@@ -208,7 +208,7 @@ def runs_of(weights: str | Path, on_messages: bool = False) -> Runs:
     name = str(weights)
     node = next((f"{f.name}_detector" for f in fields(params)
                  if f"{f.name}_detector" in NODES), name)
-    return Runs(name, _read_here(parameter_fields(params), on_messages), (node,))
+    return Runs(name, _read_here(collect_fields(params), on_messages), (node,))
 
 
 def _read_here(fields: Fields, on_messages: bool) -> Fields:
@@ -223,7 +223,7 @@ class Tracked:
     tracking: TrackingParams = TrackingParams()
 
 
-TRACKER = Runs("the tracker", parameter_fields(Tracked()), ("tracker",))
+TRACKER = Runs("the tracker", collect_fields(Tracked()), ("tracker",))
 
 range_option = click.option("--range", type=Choice(RANGE_CHOICES), default="auto",
                             show_default=True, help="Range of the detector: 69 m ahead, or 51 m "
@@ -319,7 +319,7 @@ def weights_option(default: str | None = None, multiple: bool = False) -> Callab
 def read_config(path: Path, known: Any, nodes: Collection[str] | None = None) -> dict[str, Any]:
     """Read a parameter file, see read_parameters, and print what may be misspelt in it. known: a
     dataclass of parameters, or its fields."""
-    fields = known if isinstance(known, Mapping) else parameter_fields(known)
+    fields = known if isinstance(known, Mapping) else collect_fields(known)
     values, lines = read_parameters(path, fields, nodes)
     _warn(path, lines)
     return values

@@ -22,7 +22,7 @@ from lidar_perception.cli.data import (
     out_folder,
 )
 from lidar_perception.cli.options import checked, device_option, parameter_options
-from lidar_perception.param_fields import parameter_fields
+from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.terminal import console
 from lidar_perception.training.params import FusedTraining, PointNetTraining, PointPillarsTraining
 from lidar_perception.training.request import TrainingRequest
@@ -65,7 +65,7 @@ def shared_options(function: Callable) -> Callable:
 def training_options(defaults: Any) -> Callable:
     """Decorator: one flag for each field of a training, --config and --set. The function gets
     params=...; flags take precedence."""
-    named = parameter_fields(defaults)
+    named = collect_fields(defaults)
 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)

@@ -17,7 +17,7 @@ from lidar_perception.clustering.dbscan_growth import dbscan_by_growing
 from lidar_perception.clustering.params import DbscanParams
 from lidar_perception.clustering.thinning import SLACK, max_exact_distances, thin_points
 from lidar_perception.clustering.tree import build_tree, find_touching_labels
-from lidar_perception.geometry import horizontal_range, stable_order
+from lidar_perception.geometry import counting_sort, horizontal_range
 
 
 def distance_aware_dbscan(xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:
@@ -64,7 +64,7 @@ def _sort_by_band(xyz, limits):
         # In float32, as horizontal_range computes it.
         distance = np.sqrt(xyz[i, 0] * xyz[i, 0] + xyz[i, 1] * xyz[i, 1])
         band[i] = np.searchsorted(limits, distance, side="right")
-    return stable_order(band, len(limits) + 1, np.arange(len(xyz)))
+    return counting_sort(band, len(limits) + 1, np.arange(len(xyz)))
 
 
 def _join_bands(xyz: np.ndarray, bands: list[np.ndarray], labels: np.ndarray,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lidar_perception.geometry import stable_order
+from lidar_perception.geometry import counting_sort
 
 
 @njit(cache=True, nogil=True)
@@ -55,7 +55,7 @@ def build_grid(xyz, side, reach):
                 break
             slot = (slot + 1) & mask
         column[i] = c
-    order = stable_order(column, columns, _sort_by_height(z))[0]
+    order = counting_sort(column, columns, _sort_by_height(z))[0]
 
     cell_start, cell_z = np.empty(n + 1, np.int64), np.empty(n, np.int64)
     column_start = np.empty(columns + 1, np.int64)
@@ -95,7 +95,7 @@ def _sort_by_height(z):
     low, high = z.min(), z.max()
     if high - low > 8 * len(z) + 4096:  # far outliers make too many levels for a counting sort
         return np.argsort(z, kind="mergesort")
-    return stable_order((z - low).astype(np.int32), high - low + 1, np.arange(len(z)))[0]
+    return counting_sort((z - low).astype(np.int32), high - low + 1, np.arange(len(z)))[0]
 
 
 @njit(cache=True, nogil=True)

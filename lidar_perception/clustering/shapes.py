@@ -12,7 +12,7 @@ from numba import njit
 from lidar_perception.classes import BY_SIZE, CLASSES, DETECTED, MAX_DIAGONAL
 from lidar_perception.clustering.params import BOX_SHAPES
 from lidar_perception.clustering.rectangles import fit_rectangles, sort_by_cluster
-from lidar_perception.groups import cluster_count
+from lidar_perception.groups import count_clusters
 
 
 @njit(cache=True, nogil=True)
@@ -51,7 +51,7 @@ def fit_boxes(xyz: np.ndarray, labels: np.ndarray, shape: str) -> np.ndarray:
     """
     if shape not in BOX_SHAPES:
         raise ValueError(f"shape = {shape!r} must be one of {', '.join(BOX_SHAPES)}")
-    count = cluster_count(labels)
+    count = count_clusters(labels)
     xyz, labels = np.ascontiguousarray(xyz, np.float32), np.ascontiguousarray(labels, np.int32)
     low, high, sizes = find_extents(xyz, labels, count)
     low[sizes == 0] = high[sizes == 0] = 0
@@ -79,7 +79,7 @@ def fit_ellipses(xyz: np.ndarray, labels: np.ndarray) -> np.ndarray:
         the longer one in [-pi/2, pi/2).
     """
     members = np.flatnonzero(labels > 0)
-    cluster, count = labels[members] - 1, cluster_count(labels)
+    cluster, count = labels[members] - 1, count_clusters(labels)
     sizes = np.maximum(np.bincount(cluster, minlength=count), 1)
 
     def mean(values: np.ndarray) -> np.ndarray:

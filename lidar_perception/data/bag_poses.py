@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data.bag import KeptOpen
-from lidar_perception.robot.poses import inverse, moved_boxes
-from lidar_perception.robot.tree import Missing, TransformTree
+from lidar_perception.robot.poses import invert_pose, transform_boxes
+from lidar_perception.robot.transform_tree import MissingTransform, TransformTree
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import ODOMETRY, ODOMETRY_FRAME, TF, TF_STATIC
 from lidar_perception.wire.transforms import (
@@ -58,7 +58,7 @@ class BagPoses:
         """(4, 4) at a time; None where it is not known then."""
         try:
             return self.at(np.array([stamp_ns]))[0]
-        except Missing:
+        except MissingTransform:
             return None
 
     def at(self, times: np.ndarray) -> np.ndarray:
@@ -68,9 +68,9 @@ class BagPoses:
                 return np.tile(np.eye(4), (len(times), 1, 1))
             return self._carrier_poses(times) @ self._on_carrier(times)
         if not self.fixed:
-            raise Missing(f"{self.path} has neither odometry nor a TF in which "
-                          f"'{self.frame_id}' moves; record one of them")
-        return self._tree.poses(self.fixed, self.frame_id, times, MAX_GAP)
+            raise MissingTransform(f"{self.path} has neither odometry nor a TF in which "
+                                   f"'{self.frame_id}' moves; record one of them")
+        return self._tree.lookup_many(self.fixed, self.frame_id, times, MAX_GAP)
 
     @cached_property
     def known(self) -> bool:
@@ -96,7 +96,7 @@ class BagPoses:
     def fixed(self) -> str:
         """The frame of TF that the sensor moves in; "" where nothing moves in TF."""
         moving = [self._above[i + 1] for i, frame in enumerate(self._above[:-1])
-                  if not self._seen.fixed(frame)]
+                  if not self._seen.is_fixed(frame)]
         return ODOMETRY_FRAME if ODOMETRY_FRAME in moving else moving[-1] if moving else ""
 
     def mounted(self, base: str) -> np.ndarray | None:
@@ -104,7 +104,7 @@ class BagPoses:
         does not say it."""
         above = self._chain(base)
         both = next((frame for frame in self._above if frame in above), None)
-        if both is None or not all(map(self._seen.fixed, (
+        if both is None or not all(map(self._seen.is_fixed, (
                 *self._above[:self._above.index(both)], *above[:above.index(both)]))):
             return None
         return self._seen.lookup(base, self.frame_id, 0)
@@ -116,14 +116,14 @@ class BagPoses:
         if self.carrier and self.carrier != self.frame_id:
             return self.carrier
         # Up to what moves: above that odom may be fixed in a map, and is not the robot's.
-        fixed = len([*takewhile(self._seen.fixed, self._above[:-1])])
+        fixed = len([*takewhile(self._seen.is_fixed, self._above[:-1])])
         return self._above[fixed] if fixed else ""
 
     def of(self, frame_id: str, stamp_ns: int) -> np.ndarray:
         """(4, 4): the pose of another frame in that of the clouds at a time, which takes points to
         the latter. Missing where nothing says it."""
         if self.odometry and frame_id.lstrip("/") == self._first.header.frame_id.lstrip("/"):
-            return inverse(self.at(np.array([stamp_ns]))[0])
+            return invert_pose(self.at(np.array([stamp_ns]))[0])
         return self._tree.lookup(self.frame_id, frame_id, stamp_ns, MAX_GAP)
 
     def brought(self, objects: MarkedObjects, topic: str) -> MarkedObjects:
@@ -135,18 +135,18 @@ class BagPoses:
             return objects
         try:
             pose = self.of(objects.frame_id, objects.stamp_ns)
-        except Missing as error:
+        except MissingTransform as error:
             raise InputError(f"{self.path}: the boxes on {topic} are in '{objects.frame_id}', the "
                              f"clouds in '{self.frame_id}': {error}; record TF, or the odometry, "
                              "with them") from None
-        return replace(objects, boxes=moved_boxes(objects.boxes, pose))
+        return replace(objects, boxes=transform_boxes(objects.boxes, pose))
 
     def carrier_pose(self, stamp_ns: int) -> np.ndarray:
         """(4, 4): that of the odometry. Missing where it is not known then."""
         return self._carrier_poses(np.array([stamp_ns]))[0]
 
     def _carrier_poses(self, times: np.ndarray) -> np.ndarray:
-        return self._odometry.poses(FIXED, MOVING, times, MAX_GAP)
+        return self._odometry.lookup_many(FIXED, MOVING, times, MAX_GAP)
 
     def _on_carrier(self, times: np.ndarray) -> np.ndarray:
         """(4, 4), or (M, 4, 4) where it moves on it: where on the carrier the sensor is at times
@@ -155,7 +155,7 @@ class BagPoses:
             return np.eye(4)
         if (pose := self.mounted(self.carrier)) is not None:
             return pose
-        return self._tree.poses(self.carrier, self.frame_id, times, MAX_GAP)
+        return self._tree.lookup_many(self.carrier, self.frame_id, times, MAX_GAP)
 
     @cached_property
     def _odometry(self) -> TransformTree:
@@ -175,7 +175,7 @@ class BagPoses:
         for _, _, msg in bag.messages({TF_STATIC} & self.transforms):
             self._add(tree, msg, True)
         for i, (_, _, msg) in enumerate(bag.messages({TF} & self.transforms)):
-            if i >= FIRST and (self.odometry or not all(map(tree.fixed, _chain_in(
+            if i >= FIRST and (self.odometry or not all(map(tree.is_fixed, _chain_in(
                     tree, self.frame_id)))):
                 break  # wheels may turn for long before the robot is localised
             self._add(tree, msg, False)
@@ -208,6 +208,6 @@ class BagPoses:
 def _chain_in(tree: TransformTree, frame: str) -> list[str]:
     """A frame, its parent, and so on; it alone where they go round."""
     try:
-        return tree.chain(frame)
-    except Missing:
+        return tree.find_chain(frame)
+    except MissingTransform:
         return [frame]

@@ -8,11 +8,11 @@ import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame, PointTruth
-from lidar_perception.robot.crop import cropped
-from lidar_perception.robot.deskew import Poses
+from lidar_perception.robot.crop import crop_frame
+from lidar_perception.robot.deskew import PoseLookup
 from lidar_perception.robot.params import CropParams
-from lidar_perception.robot.placing import levelling, tilted
-from lidar_perception.robot.poses import inverse, moved_boxes, moved_points
+from lidar_perception.robot.placement import find_level_transform, make_tilted_pose
+from lidar_perception.robot.poses import invert_pose, transform_boxes, transform_points
 from lidar_perception.types import GroundTruth, LidarFrame
 from lidar_perception.wire.messages import to_frame
 from lidar_perception.wire.point_times import deskew_frame
@@ -34,7 +34,7 @@ class Robot:
     intensity_max: float = 0.0
 
 
-def levelled(frame: Frame, robot: Robot, poses: Poses | None = None) -> Frame:
+def levelled(frame: Frame, robot: Robot, poses: PoseLookup | None = None) -> Frame:
     """A frame of a bag or a file, whose native() gives its message, as a level sensor at the same
     place would give it, with x ahead. Labels, camera and pose move along; boxes stay upright. Where
     anything is turned the frame_id has _level behind it.
@@ -42,14 +42,14 @@ def levelled(frame: Frame, robot: Robot, poses: Poses | None = None) -> Frame:
     poses: of the sensor (M, 4, 4) at times (M,) ns; with them points are moved to the stamp first,
     as input.deskew does. InputError of load() where one of these is not known, or the cloud has no
     times."""
-    level = levelling(tilted(robot.roll, robot.pitch), robot.ahead)
-    back = np.eye(4) if level is None else inverse(level)
+    level = find_level_transform(make_tilted_pose(robot.roll, robot.pitch), robot.ahead)
+    back = np.eye(4) if level is None else invert_pose(level)
 
     def read() -> tuple[np.ndarray, LidarFrame]:
         """indices of the points that are kept, and these."""
         message = frame.native()
         scan, indices = to_frame(message, robot.intensity_max or frame.intensity_max())
-        kept, scan = cropped(scan, robot.crop, level=level)
+        kept, scan = crop_frame(scan, robot.crop, level=level)
         if poses is not None:
             scan = deskew_frame(message, scan, indices.take(kept), poses)
         return kept, scan
@@ -57,7 +57,7 @@ def levelled(frame: Frame, robot: Robot, poses: Poses | None = None) -> Frame:
     def load() -> LidarFrame:
         scan = read()[1]
         return scan if level is None else replace(
-            scan, xyz=moved_points(scan.xyz, level),
+            scan, xyz=transform_points(scan.xyz, level),
             frame_id=f"{scan.frame_id or LIDAR_FRAME}_level")
 
     def point_truth() -> PointTruth | None:
@@ -70,7 +70,7 @@ def levelled(frame: Frame, robot: Robot, poses: Poses | None = None) -> Frame:
     def truth() -> GroundTruth | None:
         labels = frame.truth()
         return labels if labels is None or level is None else replace(
-            labels, boxes=moved_boxes(labels.boxes, level))
+            labels, boxes=transform_boxes(labels.boxes, level))
 
     def calibration() -> Calibration | None:
         camera = frame.calibration()

@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidar_perception.intensity import guessed_scale, scale_problem, to_unit
+from lidar_perception.intensity import find_scale_problem, guess_scale, to_unit
 from lidar_perception.types import Detections, LidarFrame, as_frame, check_columns, usable_returns
 
 Cloud = LidarFrame | ArrayLike  # see LidarFrame.of
@@ -94,9 +94,9 @@ def accept(cloud: Cloud, ground: np.ndarray | None, cluster_ids: np.ndarray | No
         frame = frame.take(kept)
         ground, cluster_ids = (column if column is None else column.take(kept)
                                for column in (ground, cluster_ids))
-    problem = scale_problem(frame.intensity, intensity_scale)
+    problem = find_scale_problem(frame.intensity, intensity_scale)
     if problem and frame.intensity is not None:
-        full = guessed_scale(frame.intensity, intensity_scale)
+        full = guess_scale(frame.intensity, intensity_scale)
         if full != 1.0:
             frame = replace(frame, intensity=to_unit(frame.intensity, full))
     return Accepted(frame, ground, cluster_ids, problem)

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from lidar_perception.detectors.params import NmsParams
-from lidar_perception.geometry import MAX_CORNERS, reaches, shared_area
+from lidar_perception.geometry import MAX_CORNERS, footprint_radii, overlap_area
 from lidar_perception.types import CLASSES, Detections
 
 
@@ -39,14 +39,14 @@ def suppressed(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: f
 @njit(cache=True, nogil=True)
 def _stay(boxes, group, iou):
     stays = np.ones(len(boxes), np.bool_)
-    reach, work = reaches(boxes), np.empty((4, MAX_CORNERS))
+    reach, work = footprint_radii(boxes), np.empty((4, MAX_CORNERS))
     area = boxes[:, 3] * boxes[:, 4]
     for i in range(len(boxes)):
         if not stays[i]:
             continue
         for j in range(i + 1, len(boxes)):
             if stays[j] and group[i] == group[j]:
-                shared = shared_area(boxes[i], boxes[j], reach[i] + reach[j], work)
+                shared = overlap_area(boxes[i], boxes[j], reach[i] + reach[j], work)
                 stays[j] = shared <= 0 or shared / (area[i] + area[j] - shared) <= iou
     return stays
 

@@ -9,10 +9,10 @@ from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.params import GroundParams, SensorPoseParams
 from lidar_perception.ground.patchwork import segment_by_patchwork
 from lidar_perception.ground.threshold import segment_by_threshold
-from lidar_perception.intensity import guessed_scale, to_unit
-from lidar_perception.robot.crop import cropped
+from lidar_perception.intensity import guess_scale, to_unit
+from lidar_perception.robot.crop import crop_frame
 from lidar_perception.robot.params import CropParams
-from lidar_perception.robot.placing import levelling, tilted
+from lidar_perception.robot.placement import find_level_transform, make_tilted_pose
 from lidar_perception.types import LidarFrame, as_frame, usable_returns
 
 METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool
@@ -50,7 +50,7 @@ def segment_ground(cloud: LidarFrame | ArrayLike,
 
 
 def _segment(xyz: np.ndarray, intensity: np.ndarray | None, params: GroundParams) -> np.ndarray:
-    if intensity is not None and (full := guessed_scale(intensity)) != 1.0:
+    if intensity is not None and (full := guess_scale(intensity)) != 1.0:
         intensity = to_unit(intensity, full)
     return METHODS[params.method](level_points(xyz, params.sensor_pose), intensity, params)
 
@@ -63,10 +63,11 @@ def level_points(xyz: np.ndarray, pose: SensorPoseParams) -> np.ndarray:
     """
     if pose.roll == pose.pitch == 0.0:
         return xyz
-    return xyz @ tilted(pose.roll, pose.pitch)[:3, :3].T.astype(np.float32)
+    return xyz @ make_tilted_pose(pose.roll, pose.pitch)[:3, :3].T.astype(np.float32)
 
 
 def crop_with_sensor_pose(frame: LidarFrame, crop: CropParams,
                           pose: SensorPoseParams) -> tuple[np.ndarray, LidarFrame]:
     """Crop a frame as robot.crop.cropped does, with sectors as a level sensor would see them."""
-    return cropped(frame, crop, level=levelling(tilted(pose.roll, pose.pitch)))
+    return crop_frame(frame, crop,
+                      level=find_level_transform(make_tilted_pose(pose.roll, pose.pitch)))

@@ -37,7 +37,7 @@ class CandidateRefinement(ManagedNode):
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, indices = to_frame(msg)
-            frame = self.transforms.placing(msg.header).levelled(frame)
+            frame = self.transforms.placing(msg.header).level_frame(frame)
             ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
             if clusters is None:
                 raise InputError("the cloud has no column 'cluster_id'; remap ~/input/points to "

@@ -36,7 +36,7 @@ class Clustering(ManagedNode):
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, indices = to_frame(msg)
-            frame = self.transforms.placing(msg.header).levelled(frame)
+            frame = self.transforms.placing(msg.header).level_frame(frame)
             marked = read_column(msg, "ground", indices)
             ground = np.zeros(len(frame), bool) if marked is None else marked > 0
             ids = cluster_obstacles(frame.xyz, ground, self.params.clustering)

@@ -8,7 +8,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from lidar_perception.param_fields import parameter_fields, with_values
+from lidar_perception.param_fields import collect_fields, with_values
 
 TYPES = {bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE,
          str: Parameter.Type.STRING}
@@ -27,7 +27,7 @@ def declare(node: Node, params: Any) -> Any:
 
     Raises: ValueError for a value out of range."""
     declared = {}
-    for name, f in parameter_fields(params).items():
+    for name, f in collect_fields(params).items():
         kind = _kind(f)
         value = list(f.default) if isinstance(f.default, tuple) else f.default
         if name in node._parameter_overrides:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.nodes.runtime import CLOUD, JUMP_NS, LidarNode
-from lidar_perception.robot.tree import Missing, TransformTree
+from lidar_perception.robot.transform_tree import MissingTransform, TransformTree
 from lidar_perception.tracking.ego import NO_SOURCE, Odometry, best_source, has_odometry
 from lidar_perception.tracking.params import EgoParams
 from lidar_perception.types import InputError
@@ -69,7 +69,7 @@ class EgoInput:
         pose, self.unknown = None, ""
         try:
             pose = self._of(self._source(frame_id, stamp), frame_id, stamp, self.params().max_gap)
-        except Missing as error:
+        except MissingTransform as error:
             self.unknown = str(error)
         if self.params().source == "auto":
             self._look_further(stamp, pose is not None)
@@ -84,7 +84,7 @@ class EgoInput:
             source = self._source(header.frame_id, stamp)
             if source != NO_SOURCE and not (source == "kiss_icp" and self.clouds):
                 self._of(source, header.frame_id, stamp, None)
-        except Missing as error:
+        except MissingTransform as error:
             if error.late:
                 now, max_wait = monotonic(), self.params().max_wait
                 self.late_since = self.late_since or now
@@ -148,7 +148,7 @@ class EgoInput:
     def _connected(self, frame_id: str, stamp: int) -> bool:
         try:
             self._of("tf", frame_id, stamp, self.params().max_gap)
-        except Missing as error:
+        except MissingTransform as error:
             return error.late
         return True
 
@@ -175,8 +175,9 @@ class EgoInput:
             return np.eye(4)
         self.transforms.listen()
         try:
-            poses: np.ndarray = self.transforms.tree.poses(self.scan_frame, frame_id, at, max_gap)
-        except Missing as error:
+            poses: np.ndarray = self.transforms.tree.lookup_many(self.scan_frame, frame_id, at,
+                                                                 max_gap)
+        except MissingTransform as error:
             self.apart = not error.late
             raise
         self.apart = False

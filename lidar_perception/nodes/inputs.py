@@ -29,8 +29,8 @@ from lidar_perception.nodes.runtime import (
     SENSOR_DATA,
     LidarNode,
 )
-from lidar_perception.robot.poses import inverse, moved_boxes, moved_points
-from lidar_perception.robot.tree import Missing
+from lidar_perception.robot.poses import invert_pose, transform_boxes, transform_points
+from lidar_perception.robot.transform_tree import MissingTransform
 from lidar_perception.types import PEDESTRIAN, InputError
 from lidar_perception.wire.messages import make_calibration, read_camera, to_truth
 from lidar_perception.wire.params import ViewParams
@@ -84,12 +84,12 @@ class CameraInput:
         else:
             try:
                 pose = self.node.transforms.tree.lookup(camera, lidar, to_ns(header.stamp))
-            except Missing:
+            except MissingTransform:
                 self.node.transforms.listen()
                 return None
             found = make_calibration(self.info, pose).camera()
         return found if level is None else replace(
-            found, projection=found.projection @ inverse(level))
+            found, projection=found.projection @ invert_pose(level))
 
 
 class Paired:
@@ -209,7 +209,7 @@ class SeedInput:
             people = truth.of_class(PEDESTRIAN)
             level = self.node.transforms.placing(cloud.header).level
             self.deliver(cloud, make_truth_source(people if level is None
-                                                  else moved_boxes(people, level)))
+                                                  else transform_boxes(people, level)))
 
     def _on_click(self, msg: Any) -> None:
         self.click, self.clicked = msg, None
@@ -222,11 +222,11 @@ class SeedInput:
             p, frame_id = self.click.point, self.click.header.frame_id
             try:
                 pose = self.node.transforms.to_level(header, frame_id)
-            except Missing as error:
+            except MissingTransform as error:
                 raise InputError(f"the clicked point is in frame '{frame_id}' but the cloud in "
                                  f"'{header.frame_id}' ({error}); set that as the fixed frame and "
                                  "click again") from None
-            point = moved_points(np.array([[p.x, p.y, p.z]]), pose)[0]
+            point = transform_points(np.array([[p.x, p.y, p.z]]), pose)[0]
             self.clicked = make_click_source(point, self.params)(segmented)
             self.node.get_logger().info(f"seed taken at ({p.x:.1f}, {p.y:.1f}, {p.z:.1f}), height "
                                         f"{self.clicked.height:.2f} m")

@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Any
 
 from lidar_perception.nodes import NODES
-from lidar_perception.param_fields import parameter_fields
+from lidar_perception.param_fields import collect_fields
 
 ALIKE = 0.85  # 0..1, see difflib: a name is another one, misspelt
 MOST = 200    # names that are looked at
@@ -21,7 +21,7 @@ def node_parameters(name: str) -> dict[str, Any]:
     for path in NODES[name][1:]:
         module, _, params = path.rpartition(".")
         made = getattr(importlib.import_module(f"lidar_perception.{module}"), params)()
-        found |= parameter_fields(made)
+        found |= collect_fields(made)
     return found
 
 

@@ -28,10 +28,10 @@ STOP_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
 def help_text(name: str) -> str:
     """What --help prints: how to start the node, and its parameters."""
     from lidar_perception.nodes.known import node_parameters
-    from lidar_perception.param_fields import described
+    from lidar_perception.param_fields import describe_fields
     lines = [f"Usage: {name} --ros-args [-p PARAMETER:=VALUE] [-r FROM:=TO] [--params-file YAML]",
              "", "Parameters:"]
-    return "\n".join([*lines, *described(node_parameters(name))])
+    return "\n".join([*lines, *describe_fields(node_parameters(name))])
 
 
 def run(name: str, arguments: list[str]) -> int:

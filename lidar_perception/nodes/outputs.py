@@ -19,7 +19,7 @@ from lidar_perception.nodes.track_outputs import (
     has_detections_3d,
     lifetime_ns,
 )
-from lidar_perception.robot.poses import inverse, moved_boxes
+from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import make_detection_markers, make_xyz_cloud
@@ -35,7 +35,7 @@ def placed(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[Any, np.nda
     placing = node.transforms.placing(header)
     if placing.frame_id != header.frame_id:
         header = header_message(to_ns(header.stamp), placing.frame_id, bag_message)
-    return header, boxes if placing.out is None else moved_boxes(boxes, placing.out)
+    return header, boxes if placing.out is None else transform_boxes(boxes, placing.out)
 
 
 class ClusterBoxes:
@@ -82,7 +82,7 @@ class Obstacles:
             chosen = find_obstacles(xyz, ground, self.node.robot.obstacles,
                                     params.ground.sensor_pose)
             self.publisher.publish(encode(make_xyz_cloud(
-                msg, placing.in_cloud(xyz.compress(chosen, axis=0)), indices.compress(chosen),
+                msg, placing.to_cloud_frame(xyz.compress(chosen, axis=0)), indices.compress(chosen),
                 bag_message)))
 
 
@@ -141,8 +141,8 @@ class DetectionOutputs:
             return None
         placing = self.node.transforms.placing(cloud)
         if placing.level is not None:
-            found = replace(found, boxes=moved_boxes(found.boxes, inverse(placing.level)))
-        return self.tracks.publish(cloud, found, placing.in_cloud(xyz))
+            found = replace(found, boxes=transform_boxes(found.boxes, invert_pose(placing.level)))
+        return self.tracks.publish(cloud, found, placing.to_cloud_frame(xyz))
 
 
 class CandidateOutputs:

@@ -43,7 +43,7 @@ class SensorCheck:
             kept, frame = self.node.transforms.cropped(frame, params.crop, placing)
             self.node.counts["cropped"] = len(indices) - len(kept)
             indices, params = indices.take(kept), replace(params, crop=CropParams())
-        return placing.levelled(frame), indices, params
+        return placing.level_frame(frame), indices, params
 
     def problem(self, frame: LidarFrame, params: Any) -> str | None:
         """What does not fit the parameters that frame() gave, with the remedy; None if nothing is

@@ -17,11 +17,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.nodes.reception import WARN, Problem
-from lidar_perception.robot.crop import cropped
+from lidar_perception.robot.crop import crop_frame
 from lidar_perception.robot.params import CropParams
-from lidar_perception.robot.placing import Placing, levelling, tilted
-from lidar_perception.robot.poses import inverse
-from lidar_perception.robot.tree import Missing, TransformTree
+from lidar_perception.robot.placement import Placement, find_level_transform, make_tilted_pose
+from lidar_perception.robot.poses import invert_pose
+from lidar_perception.robot.transform_tree import MissingTransform, TransformTree
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_frame
@@ -65,7 +65,7 @@ class Transforms:
         self.sweep: float | None = None  # seconds from the stamp to the last point of a cloud
         self.lacking: dict[str, str] = {}  # what asked for it -> what is not there
         self.known: dict[str, Any] = {}  # for the diagnostics
-        self._last: tuple[tuple[str, int], Placing] = (("", -1), Placing(""))
+        self._last: tuple[tuple[str, int], Placement] = (("", -1), Placement(""))
         self._met: set[tuple[str, str]] = set()  # frames that have been connected
         self._listening = self._hearing = False
         self._installed = has_tf()
@@ -131,7 +131,7 @@ class Transforms:
         self._changed()
 
     def _changed(self) -> None:
-        self._last = (("", -1), Placing(""))
+        self._last = (("", -1), Placement(""))
 
     # What a cloud needs
 
@@ -150,7 +150,7 @@ class Transforms:
             if self.node.robot.input.deskew != "off":
                 self.sensor_poses(self.node.robot.input.deskew, frame_id,
                                   np.array([stamp + round(self._sweep_of(cloud) * SECOND)]))
-        except Missing as error:
+        except MissingTransform as error:
             return str(error) if error.late else None
         return None
 
@@ -159,9 +159,9 @@ class Transforms:
         a driver may be found before robot_state_publisher."""
         try:
             self.tree.lookup(frame, frame_id, stamp)
-        except Missing as error:
+        except MissingTransform as error:
             new = (frame, frame_id) not in self._met and "TF" not in self.lacking
-            raise Missing(str(error), error.late or new) from None
+            raise MissingTransform(str(error), error.late or new) from None
         self._met.add((frame, frame_id))
 
     def _sweep_of(self, cloud: Any) -> float:
@@ -175,16 +175,16 @@ class Transforms:
             self.sweep = float(seconds[np.isfinite(seconds)].max(initial=0.0))
         return self.sweep
 
-    def placing(self, header: Any) -> Placing:
+    def placing(self, header: Any) -> Placement:
         """Of a cloud with this header."""
         key = header.frame_id, to_ns(header.stamp)
         if not (self.base_frame or self.target_frame or self.node.robot.input.ahead):
-            return Placing(header.frame_id)
+            return Placement(header.frame_id)
         if self._last[0] != key:
             self._last = key, self._placing(*key)
         return self._last[1]
 
-    def _placing(self, frame_id: str, stamp_ns: int) -> Placing:
+    def _placing(self, frame_id: str, stamp_ns: int) -> Placement:
         base = self._looked_up("base_frame", self.base_frame, frame_id, stamp_ns)
         if base is not None and not 0.0 <= base[2, 3] <= 50.0:
             self.lacking["base_frame"] = (
@@ -196,12 +196,12 @@ class Transforms:
         if upright is None and ahead:  # the turn comes after the tilt, so both are done here
             upright = self._by_hand()
             upright = np.eye(4) if upright is None else upright
-        level = None if upright is None else levelling(upright, ahead)
+        level = None if upright is None else find_level_transform(upright, ahead)
         target = self._looked_up("target_frame", self.target_frame, frame_id, stamp_ns)
         if target is None:
-            return Placing(frame_id, base, level, None if level is None else inverse(level))
-        return Placing(self.target_frame, base, level,
-                       target if level is None else target @ inverse(level))
+            return Placement(frame_id, base, level, None if level is None else invert_pose(level))
+        return Placement(self.target_frame, base, level,
+                         target if level is None else target @ invert_pose(level))
 
     def _looked_up(self, what: str, frame: str, frame_id: str, stamp_ns: int) -> np.ndarray | None:
         """The pose of frame_id in the frame that the parameter `what` names; None where there is
@@ -211,13 +211,13 @@ class Transforms:
             return None
         try:
             return self.tree.lookup(frame, frame_id, stamp_ns)
-        except Missing as error:
+        except MissingTransform as error:
             instead = {"base_frame": "ground.sensor_pose stands",
                        "target_frame": f"results are in '{frame_id}'"}[what]
             self.lacking[what] = f"{what} '{frame}': {error}; {instead}"
             return None
 
-    def mounted(self, params: Any, placing: Placing) -> Any:
+    def mounted(self, params: Any, placing: Placement) -> Any:
         """params, a node's, for a frame that placing has levelled; its params.ground.sensor_pose
         stands where TF has no base_frame."""
         height = params.ground.sensor_pose.height
@@ -229,7 +229,7 @@ class Transforms:
                 params.ground, sensor_pose=SensorPoseParams(height=height)))
         return params
 
-    def cropped(self, frame: LidarFrame, crop: CropParams, placing: Placing
+    def cropped(self, frame: LidarFrame, crop: CropParams, placing: Placement
                 ) -> tuple[np.ndarray, LidarFrame]:
         """As robot.crop.cropped. A body in a base_frame that TF does not have is not cropped, as
         it could be anything."""
@@ -244,8 +244,8 @@ class Transforms:
                     ", in which it is read; give it in that frame, as a file of setup has it too")
         level, pose = placing.level, None if placing.base is not None else self._by_hand()
         if level is None and pose is not None:
-            level = levelling(pose)
-        return cropped(frame, crop, placing.base, level)
+            level = find_level_transform(pose)
+        return crop_frame(frame, crop, placing.base, level)
 
     def to_level(self, header: Any, frame_id: str) -> np.ndarray:
         """(4, 4): takes points of a frame to the level frame of a cloud with this header. Missing
@@ -262,9 +262,9 @@ class Transforms:
                      max_gap: float | None = None) -> np.ndarray:
         """(M, 4, 4): the poses of a frame of the robot at times (M,) ns, in one that does not
         move: by the source odometry or tf, the latter in input.fixed_frame. max_gap as in
-        TransformTree.poses. Missing where they are not known."""
+        TransformTree.lookup_many. Missing where they are not known."""
         if source == "tf":
-            return self.tree.poses(self.node.robot.input.fixed_frame, frame_id, at, max_gap)
+            return self.tree.lookup_many(self.node.robot.input.fixed_frame, frame_id, at, max_gap)
         if frame_id.lstrip("/") == self.odometry_frame != "":  # it does not move
             return np.tile(np.eye(4), (len(at), 1, 1))
         return self.odometry_poses(at, max_gap) @ self._on_carrier(frame_id, at, max_gap)
@@ -272,30 +272,31 @@ class Transforms:
     def odometry_poses(self, at: np.ndarray, max_gap: float | None = None) -> np.ndarray:
         """(M, 4, 4): the poses at times (M,) ns of what the odometry is of. Missing as above."""
         if self.odometry_ns is None:
-            raise Missing(f"nothing has come on {self.node.resolve_topic_name('~/input/odometry')}"
-                          "; remap it to the odometry's topic")
+            topic = self.node.resolve_topic_name("~/input/odometry")
+            raise MissingTransform(f"nothing has come on {topic}; remap it to the odometry's topic")
         try:
-            return self.odometry.poses(FIXED, MOVING, at, max_gap)
-        except Missing as error:
+            return self.odometry.lookup_many(FIXED, MOVING, at, max_gap)
+        except MissingTransform as error:
             said = str(error).replace(FIXED, self.odometry_frame).replace(MOVING, self.carrier)
-            raise Missing(f"{self.node.resolve_topic_name('~/input/odometry')}: {said}",
-                          error.late) from None
+            raise MissingTransform(f"{self.node.resolve_topic_name('~/input/odometry')}: {said}",
+                                   error.late) from None
 
     def _on_carrier(self, frame_id: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
         """(M or 1, 4, 4): where on what the odometry is of a frame is at times (M,) ns."""
         if frame_id.lstrip("/") == self.carrier:
             return np.eye(4)[None]
         if not self.carrier:
-            raise Missing(f"the odometry on {self.node.resolve_topic_name('~/input/odometry')} "
-                          "says in no child_frame_id what it is of; set it where it is made")
+            topic = self.node.resolve_topic_name("~/input/odometry")
+            raise MissingTransform(f"the odometry on {topic} says in no child_frame_id what it is "
+                                   "of; set it where it is made")
         try:
-            return self.tree.poses(self.carrier, frame_id, at, max_gap)
-        except Missing as error:
+            return self.tree.lookup_many(self.carrier, frame_id, at, max_gap)
+        except MissingTransform as error:
             self.listen()
             pose = self._by_hand() if self.carrier == self.base_frame else None
             if pose is None:
-                raise Missing(f"the odometry is of '{self.carrier}': {error}",
-                              error.late) from None
+                raise MissingTransform(f"the odometry is of '{self.carrier}': {error}",
+                                       error.late) from None
             return pose[None]
 
     def carries(self, frame_id: str) -> bool:
@@ -305,7 +306,7 @@ class Transforms:
             return True
         try:
             self._on_carrier(frame_id, np.array([self.odometry_ns]), None)
-        except Missing as error:
+        except MissingTransform as error:
             return error.late
         return True
 
@@ -313,7 +314,7 @@ class Transforms:
         """The sensor's pose above the ground as the parameters have it."""
         ground = getattr(self.node.params, "ground", None)
         pose = ground and ground.sensor_pose
-        return None if pose is None else tilted(pose.roll, pose.pitch, pose.height)
+        return None if pose is None else make_tilted_pose(pose.roll, pose.pitch, pose.height)
 
     def corrected(self, msg: Any) -> Any:
         """The cloud with its points moved to its stamp; the cloud itself, counted, where what is

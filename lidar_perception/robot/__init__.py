@@ -1,1 +1,1 @@
-"""The sensor on its robot: what is cropped, where it is mounted, and how it moves."""
+"""The sensor on its robot: crop, mounting, coordinate frames and motion correction."""

@@ -1,22 +1,28 @@
-"""The crop before everything: the robot's own body, what is too near or too far, sectors."""
+"""Crop of a cloud: the robot's own body, points that are too near or too far, and sectors."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from lidar_perception.robot.params import CropParams
-from lidar_perception.robot.poses import moved_points
+from lidar_perception.robot.poses import transform_points
 from lidar_perception.types import LidarFrame
 
 
-def kept_points(xyz: np.ndarray, params: CropParams, base: np.ndarray | None = None,
-                level: np.ndarray | None = None) -> np.ndarray:
-    """(N,) bool: the points (N, 3) of the sensor's frame that are not left out. base (4, 4): the
-    sensor's pose in the frame of params.body; level (4, 4): takes its points to the same place with
-    z up and x ahead, where params.sectors are. None: that is the sensor's own frame.
+def select_points(xyz: np.ndarray, params: CropParams, base: np.ndarray | None = None,
+                  level: np.ndarray | None = None) -> np.ndarray:
+    """Select the points (N, 3) in the sensor's frame that the crop keeps.
 
-    A point on a limit of range or body is kept, one on the edge of a sector is left out. Points
-    that are not finite count as far away.
+    A point on a limit of range or body is kept; a point on the edge of a sector is removed. Points
+    that are not finite count as infinitely far away.
+
+    Args:
+        base: (4, 4) pose of the sensor in the frame of params.body; None for the sensor's frame.
+        level: (4, 4) transform of points to the level frame of params.sectors, with z up and x
+            ahead; None for the sensor's frame.
+
+    Returns:
+        (N,) bool.
     """
     kept = np.ones(len(xyz), bool)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -26,7 +32,7 @@ def kept_points(xyz: np.ndarray, params: CropParams, base: np.ndarray | None = N
             if params.max_range:
                 kept &= square <= np.float32(params.max_range) ** 2
         if params.body:
-            at = xyz if base is None else moved_points(xyz, base)
+            at = xyz if base is None else transform_points(xyz, base)
             low, high = np.reshape(params.body, (2, 3)).astype(xyz.dtype)
             kept &= ~((at > low) & (at < high)).all(axis=1)
         if params.sectors:
@@ -38,11 +44,15 @@ def kept_points(xyz: np.ndarray, params: CropParams, base: np.ndarray | None = N
     return kept
 
 
-def cropped(frame: LidarFrame, params: CropParams, base: np.ndarray | None = None,
-            level: np.ndarray | None = None) -> tuple[np.ndarray, LidarFrame]:
-    """indices (M,) int64 of the points of the frame that are kept, see kept_points, and the frame
-    of these; the frame itself where nothing is to be left out."""
+def crop_frame(frame: LidarFrame, params: CropParams, base: np.ndarray | None = None,
+               level: np.ndarray | None = None) -> tuple[np.ndarray, LidarFrame]:
+    """Crop a frame; base and level are those of select_points.
+
+    Returns:
+        indices (M,) int64 of the points kept, and the frame of these points; the frame itself if
+        params removes nothing.
+    """
     if not params.enabled:
         return np.arange(len(frame)), frame
-    indices = np.flatnonzero(kept_points(frame.xyz, params, base, level))
+    indices = np.flatnonzero(select_points(frame.xyz, params, base, level))
     return indices, frame.take(indices)

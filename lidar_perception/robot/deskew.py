@@ -1,4 +1,4 @@
-"""Motion correction: the points of a turn, measured one after the other, moved to one moment."""
+"""Motion correction: points of one sweep, measured one after the other, moved to one time."""
 
 from __future__ import annotations
 
@@ -7,27 +7,33 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lidar_perception.robot.poses import inverse
+from lidar_perception.robot.poses import invert_pose
 
-MOMENTS = 4096  # of a turn of 0.1 s each is 24 us, in which a car at 30 m/s moves by 0.7 mm
+# Over a sweep of 0.1 s the poses are 24 us apart; a car at 30 m/s moves by 0.7 mm in that time.
+MAX_POSES = 4096
 
-Poses = Callable[[np.ndarray], np.ndarray]
+# at (M,) seconds after the stamp -> poses (M, 4, 4) of the sensor in any frame that does not move.
+PoseLookup = Callable[[np.ndarray], np.ndarray]
 
 
-def deskewed(xyz: np.ndarray, seconds: np.ndarray, poses: Poses) -> np.ndarray:
-    """(N, 3) float32: points (N, 3), each in the sensor's frame of the time it was measured at,
-    seconds (N,) after the stamp, in the sensor's frame at the stamp. N may be 0.
+def deskew(xyz: np.ndarray, seconds: np.ndarray, poses: PoseLookup) -> np.ndarray:
+    """Move points to the sensor's frame at the stamp. The work is linear in N.
 
-    poses(at (M,) seconds after the stamp) gives the sensor's poses (M, 4, 4) in any frame that
-    does not move. It is asked for MOMENTS times at most, so that the work is linear in N.
+    Args:
+        xyz: (N, 3) points, each in the sensor's frame at its own time; N may be 0.
+        seconds: (N,) time of each point after the stamp.
+        poses: motion of the sensor, looked up once for at most MAX_POSES times and the stamp.
+
+    Returns:
+        (N, 3) float32.
     """
     xyz = np.asarray(xyz, np.float32)
     if not len(xyz):
         return xyz
     low, high = float(seconds.min()), float(seconds.max())
-    count = MOMENTS if high > low else 1
+    count = MAX_POSES if high > low else 1
     found = poses(np.append(np.linspace(low, high, count), 0.0))
-    to_stamp = (inverse(found[-1]) @ found[:-1]).astype(np.float32)
+    to_stamp = (invert_pose(found[-1]) @ found[:-1]).astype(np.float32)
     which = np.zeros(len(xyz), np.intp)
     if count > 1:
         which = np.rint((seconds - low) * ((count - 1) / (high - low))).astype(np.intp)
@@ -35,31 +41,39 @@ def deskewed(xyz: np.ndarray, seconds: np.ndarray, poses: Poses) -> np.ndarray:
             + to_stamp[:, :3, 3].take(which, axis=0))
 
 
-def skewed(xyz: np.ndarray, seconds: np.ndarray, poses: Poses) -> np.ndarray:
-    """(N, 3) float32: the inverse of deskewed, what a sensor that moves reports of points (N, 3)
-    of its frame at the stamp, met at seconds (N,)."""
-    def back(at: np.ndarray) -> np.ndarray:
+def skew(xyz: np.ndarray, seconds: np.ndarray, poses: PoseLookup) -> np.ndarray:
+    """Invert deskew: return (N, 3) float32, the points as a moving sensor reports them.
+
+    xyz (N, 3) are in the sensor's frame at the stamp; point i is measured at seconds[i].
+    """
+    def invert_poses(at: np.ndarray) -> np.ndarray:
         found = poses(at)
-        return inverse(inverse(found[-1]) @ found)
-    return deskewed(xyz, seconds, back)
+        return invert_pose(invert_pose(found[-1]) @ found)
+    return deskew(xyz, seconds, invert_poses)
 
 
-def steady(velocity: np.ndarray, rotation: np.ndarray) -> Poses:
-    """Poses of a sensor that moves evenly: velocity (3,) m/s and rotation (3,) rad/s, both in its
-    own frame, as the twist of a nav_msgs/Odometry has them; on an arc."""
+def make_constant_motion(velocity: np.ndarray, rotation: np.ndarray) -> PoseLookup:
+    """Return the poses of a sensor that moves on an arc at constant speed.
+
+    velocity (3,) in m/s and rotation (3,) in rad/s are in the sensor's own frame, as in the twist
+    of a nav_msgs/Odometry.
+    """
     velocity, rotation = np.asarray(velocity, np.float64), np.asarray(rotation, np.float64)
 
     def poses(at: np.ndarray) -> np.ndarray:
         found = np.tile(np.eye(4), (len(at), 1, 1))
         found[:, :3, :3] = Rotation.from_rotvec(at[:, None] * rotation).as_matrix()
-        found[:, :3, 3] = np.einsum("mij,j->mi", _mean_turn(at, rotation), velocity) * at[:, None]
+        found[:, :3, 3] = np.einsum("mij,j->mi", _mean_rotation(at, rotation),
+                                    velocity) * at[:, None]
         return found
     return poses
 
 
-def _mean_turn(at: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """(M, 3, 3): the mean of the rotations from 0 to at (M,), which takes the velocity to the way
-    over time (the left Jacobian of SO(3))."""
+def _mean_rotation(at: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Return (M, 3, 3) the mean rotation from 0 to each time of at (M,): SO(3)'s left Jacobian.
+
+    It maps the velocity to the distance travelled divided by the time.
+    """
     speed = float(np.linalg.norm(rotation))
     if speed == 0.0:
         return np.tile(np.eye(3), (len(at), 1, 1))

@@ -1,4 +1,4 @@
-"""What of a cloud is left out, because of the robot that carries the sensor."""
+"""Parameters of the crop, which depends on the robot that carries the sensor."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lidar_perception.param_fields import Params, param
 
 @dataclass(frozen=True)
 class CropParams(Params):
-    """What is left out before everything else; by default nothing."""
+    """Crop before all other processing; by default it removes nothing."""
 
     body: tuple[float, ...] = param(
         float, "The robot's own body: points in the box [min x, min y, min z, max x, max y, max z] "
@@ -27,7 +27,7 @@ class CropParams(Params):
 
     @property
     def enabled(self) -> bool:
-        """Whether anything is left out."""
+        """True if the crop removes anything."""
         return self != CropParams()
 
     def check(self) -> None:

@@ -109,7 +109,7 @@ def compilation_reported(say: Callable[[str], object] | None = None,
 def _cached() -> bool:
     """Return True if Numba has cached a function that all detectors use, since its file changed."""
     from lidar_perception import geometry
-    function: Any = geometry.stable_order
+    function: Any = geometry.counting_sort
     source = Path(geometry.__file__)
     if not hasattr(function, "stats"):  # NUMBA_DISABLE_JIT
         return True

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidar_perception.robot.crop import kept_points
+from lidar_perception.robot.crop import select_points
 from lidar_perception.robot.params import CropParams
 from lidar_perception.sensor_setup.beams import Beams
 from lidar_perception.sensor_setup.mount import Mount
@@ -100,7 +100,7 @@ def coverage_of(scans: Sequence[Scan], nearest: Nearest, mount: Mount | None,
         _ways(rows) @ mount.normal * MET < -mount.height)
     meets |= not meets.any()  # where that cannot be told, as from high above
     open_ = (seen > 0).any(axis=0) | ~meets.any(axis=0)
-    inside = [~kept_points(scan.xyz, CropParams(body=tuple(box.tolist()))) for scan in scans]
+    inside = [~select_points(scan.xyz, CropParams(body=tuple(box.tolist()))) for scan in scans]
     others = float(sum((i & ~m).sum() for i, m in zip(inside, mine))
                    / max(1, sum(i.sum() for i in inside)))
     found = Coverage(rows, seen, body, box, others, sum(m.sum() for m in mine) / max(1, total),

@@ -11,9 +11,9 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.clustering.cluster import cluster
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.param_fields import with_values
-from lidar_perception.robot.crop import cropped
-from lidar_perception.robot.placing import tilted
-from lidar_perception.robot.poses import moved_points
+from lidar_perception.robot.crop import crop_frame
+from lidar_perception.robot.placement import make_tilted_pose
+from lidar_perception.robot.poses import transform_points
 from lidar_perception.sensor_setup.files import chosen_params
 from lidar_perception.sensor_setup.measure import Measured
 from lidar_perception.sensor_setup.scans import RETROREFLECTOR
@@ -79,7 +79,7 @@ def _ground(figure: Any, m: Measured) -> bool:
     i = next(k for k, plane in enumerate(m.mount.planes) if plane is not None)
     plane, scan = m.mount.planes[i], m.scans[i]
     assert plane is not None
-    xyz = moved_points(scan.xyz, tilted(plane.roll, plane.pitch, plane.height))
+    xyz = transform_points(scan.xyz, make_tilted_pose(plane.roll, plane.pitch, plane.height))
     near = np.hypot(*xyz[:, :2].T) < 25.0
     above, side = figure.subplots(1, 2)
     some = _some(near)
@@ -148,7 +148,7 @@ def _scan(figure: Any, m: Measured) -> bool:
         scan.intensity / params.input.intensity_max if params.input.intensity_max else
         scan.intensity).astype(np.float32)
     frame = LidarFrame(scan.xyz.astype(np.float32), intensity)
-    _, frame = cropped(frame, params.crop)
+    _, frame = crop_frame(frame, params.crop)
     if m.mount is None:  # a plane at an unknown height would take furniture for ground
         ground = np.zeros(len(frame), bool)
     else:

@@ -13,7 +13,7 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.clustering.density import adapt_to_density
 from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams
 from lidar_perception.param_fields import flatten, with_values
-from lidar_perception.robot.poses import moved_points
+from lidar_perception.robot.poses import transform_points
 from lidar_perception.sensor_setup.doubts import (
     NOT_AHEAD,
     doubts,
@@ -124,7 +124,7 @@ def chosen_params(m: Measured) -> dict[str, tuple[Any, str]]:
         for name, value, error in (("roll", q.roll, q.error[1]), ("pitch", q.pitch, q.error[2])):
             out[f"ground.sensor_pose.{name}"] = (
                 round(value, 4), f"{np.degrees(value):.2f} +- {np.degrees(error):.2f} degrees")
-        near = [np.percentile(np.hypot(*moved_points(s.xyz[p.on], q.pose)[:, :2].T), 1)
+        near = [np.percentile(np.hypot(*transform_points(s.xyz[p.on], q.pose)[:, :2].T), 1)
                 for s, p in zip(m.scans, q.planes) if p is not None]
         start = round(NEAREST_GROUND * float(np.median(near)), 1)
         out["ground.patchwork.min_range"] = (start, "the nearest ground is "
@@ -154,7 +154,7 @@ def _in_base(m: Measured) -> str:
     if pose is None:
         return "\nIt is in the sensor's frame. Nodes with base_frame read it in that."
     low, high = np.reshape(m.coverage.box, (2, 3))
-    corners = moved_points(np.array([*itertools.product(*zip(low, high))]), pose)
+    corners = transform_points(np.array([*itertools.product(*zip(low, high))]), pose)
     return (f"\nIt is in the sensor's frame. Nodes with base_frame read it in that; {where}:"
             f"\nbody: {_text((*corners.min(axis=0).round(2), *corners.max(axis=0).round(2)))}")
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.robot.crop import kept_points
+from lidar_perception.robot.crop import select_points
 from lidar_perception.robot.params import CropParams
-from lidar_perception.robot.poses import inverse, moved_points
+from lidar_perception.robot.poses import invert_pose, transform_points
 from lidar_perception.sensor_setup.beams import Beams, azimuth_steps, beams_of, range_noise
 from lidar_perception.sensor_setup.coverage import Coverage, coverage_of, nearest_of, stands_still
 from lidar_perception.sensor_setup.motion import (
@@ -121,7 +121,7 @@ def measured(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: 
     still = True if len(scans) > 1 and _way(scans, mount, heading, told) < HARDLY else still
     coverage = coverage_of(scans, nearest, mount, still)
     ranges = np.concatenate([s.range for s in scans])
-    away = ranges[kept_points(np.concatenate([s.xyz for s in scans]), CropParams(
+    away = ranges[select_points(np.concatenate([s.xyz for s in scans]), CropParams(
         body=tuple(coverage.box.tolist()) if coverage.fits else ()))]
     least, greatest = np.percentile(away if len(away) else ranges, [0.02, 99.995])
     model, error = model_of(beams)
@@ -141,13 +141,13 @@ def _heading(scans: Sequence[Scan], numbers: Sequence[int], mount: Mount | None,
     if told.base or not told.poses:
         return ahead_of(shifts, driven(told.poses, shifts))
     # Odometry of the sensor itself says no base's x, but where it went.
-    level = inverse(mount.pose)
+    level = invert_pose(mount.pose)
     return ahead_of(driven({number: sensor @ level for number, sensor in told.poses.items()},
                            shifts), {})
 
 
 def _levelled(scans: Sequence[Scan], mount: Mount) -> list[np.ndarray]:
-    return [moved_points(scan.xyz, mount.pose) for scan in scans]
+    return [transform_points(scan.xyz, mount.pose) for scan in scans]
 
 
 def _way(scans: Sequence[Scan], mount: Mount | None, heading: Ahead | None, told: Told) -> float:

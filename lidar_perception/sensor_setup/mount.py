@@ -10,7 +10,7 @@ import numpy as np
 from lidar_perception.data.mount_check import MAX_LEAN_DEG
 from lidar_perception.ground.params import ThresholdParams
 from lidar_perception.ground.threshold import fit_plane, fit_plane_by_ransac, height_above_plane
-from lidar_perception.robot.placing import tilted
+from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.sensor_setup.scans import Scan
 
 # Planes up to this lean against the sensor's own axes; a sensor that leans more has another frame.
@@ -66,7 +66,7 @@ class Mount(NamedTuple):
     @property
     def pose(self) -> np.ndarray:
         """(4, 4): takes points of the sensor to a level frame on the ground below it."""
-        return tilted(self.roll, self.pitch, self.height)
+        return make_tilted_pose(self.roll, self.pitch, self.height)
 
     @property
     def normal(self) -> np.ndarray:

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidar_perception.geometry import elevations
-from lidar_perception.intensity import INTENSITY_FIELDS, MAX_UNIT, full_scale
+from lidar_perception.geometry import elevation_angles
+from lidar_perception.intensity import INTENSITY_FIELDS, MAX_UNIT, infer_full_scale
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import to_frame
 from lidar_perception.wire.point_times import NAMES as TIMES
@@ -69,7 +69,7 @@ def scan_of(msg: Any, name: str = "the cloud") -> Scan:
             problem = str(error)
     ground_range = np.hypot(xyz[:, 0], xyz[:, 1])
     return Scan(xyz, np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) % 360.0,
-                np.degrees(elevations(xyz)), ranges, ground_range,
+                np.degrees(elevation_angles(xyz)), ranges, ground_range,
                 _column(points, indices, INTENSITY_FIELDS, float),
                 _column(points, indices, RINGS, np.int64), seconds, frame.stamp_ns, frame.frame_id,
                 columns, problem)
@@ -133,7 +133,7 @@ def intensity_of(scans: Sequence[Scan]) -> Intensity | None:
     some = values[::max(1, len(values) // 10_000)]  # of all scans: one may begin with zeros
     whole = bool((some == np.round(some)).all())
     # Whole numbers that end at 1, as floats, are of no known driver: they count as integers.
-    full = full_scale(values, np.int64 if whole else values.dtype)
+    full = infer_full_scale(values, np.int64 if whole else values.dtype)
     if greatest > MAX_UNIT * full:
         full = greatest
     bright = float((values >= RETROREFLECTOR * full).mean())

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from lidar_perception.data.bag_poses import BagPoses
-from lidar_perception.robot.placing import roll_pitch
-from lidar_perception.robot.poses import inverse
-from lidar_perception.robot.tree import Missing
+from lidar_perception.robot.placement import find_roll_pitch
+from lidar_perception.robot.poses import invert_pose
+from lidar_perception.robot.transform_tree import MissingTransform
 
 FOOTPRINT = "base_footprint"  # on the ground below base_link (REP-120)
 
@@ -34,7 +34,7 @@ class Told(NamedTuple):
         """Degrees, of the sensor in the base; NaN where that is not told."""
         if self.mount is None:
             return np.nan, np.nan
-        roll, pitch = np.degrees(roll_pitch(self.mount))
+        roll, pitch = np.degrees(find_roll_pitch(self.mount))
         return float(roll), float(pitch)
 
     @property
@@ -76,7 +76,7 @@ def _base_pose(poses: BagPoses, stamp_ns: int, mount: np.ndarray | None) -> np.n
     if poses.carrier == poses.base:
         try:
             return poses.carrier_pose(stamp_ns)
-        except Missing:
+        except MissingTransform:
             return None
     pose = poses(stamp_ns)
-    return None if pose is None or mount is None else pose @ inverse(mount)
+    return None if pose is None or mount is None else pose @ invert_pose(mount)

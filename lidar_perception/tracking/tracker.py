@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidar_perception.robot.poses import moved_boxes
+from lidar_perception.robot.poses import transform_boxes
 from lidar_perception.tracking import motion
 from lidar_perception.tracking.ego import Ego, jumped, next_ego, usable
 from lidar_perception.tracking.existence import probability
@@ -73,7 +73,7 @@ class Tracker:
             return self._reported(np.zeros(len(self._states), bool))
         self._move_ego(pose, seconds)
         boxes, class_ids, scores = self._usable(detections)
-        boxes = moved_boxes(boxes, self._ego.pose)
+        boxes = transform_boxes(boxes, self._ego.pose)
         states = predicted(self._states, seconds, self.params)
         i, j = matched(states, boxes, class_ids, scores, self.params, seconds)
         states = updated(states, i, boxes[j], class_ids[j], scores[j], self.params,
@@ -179,7 +179,7 @@ def _in_sensor_frame(states: States, ego: Ego, seen: np.ndarray,
     side = -1.0 if back[2, 2] < 0 else 1.0  # a sensor that hangs upside down sees from below
     covariances = motion.turned(chosen.covariances, cos, sin, side)
     velocities = chosen.means[:, 2:4] @ np.array([[cos, sin], [-side * sin, side * cos]])
-    found = Detections.of(moved_boxes(chosen.boxes(), back), chosen.class_ids, scores[indices])
+    found = Detections.of(transform_boxes(chosen.boxes(), back), chosen.class_ids, scores[indices])
     return Tracks(chosen.ids, found, velocities, chosen.moving, covariances,
                   side * chosen.means[:, 5],
                   chosen.height_variances, seen[indices], chosen.ages)

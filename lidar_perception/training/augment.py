@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidar_perception.geometry import bev_iou, elevations, to_box_frame, within, wrap_angle
+from lidar_perception.geometry import bev_iou, elevation_angles, is_within, to_box_frame, wrap_angle
 from lidar_perception.training.params import AugmentParams, NoiseParams, ThingParams
 from lidar_perception.training.pasting import MIN_RANGE_M, find_points_in_box
 from lidar_perception.types import SENSOR_HEIGHT
@@ -75,7 +75,7 @@ def crop_scene(scene: TrainingScene, low: np.ndarray, high: np.ndarray) -> Train
     kept = np.ones(len(scene.points), bool)
     for axis in range(3):
         kept &= (scene.points[:, axis] >= low[axis]) & (scene.points[:, axis] < high[axis])
-    inside = within(scene.boxes, low, high)
+    inside = is_within(scene.boxes, low, high)
     return replace(scene, points=scene.points[kept], boxes=scene.boxes[inside],
                    class_ids=scene.class_ids[inside], wanted=scene.wanted[inside])
 
@@ -174,7 +174,7 @@ def blur_ranges(points: np.ndarray, beam: float, point: float,
         point: Standard deviation in metres of each point's own error.
     """
     ranges = np.maximum(np.linalg.norm(points[:, :3], axis=1), MIN_RANGE_M)
-    beams = np.floor(elevations(points) / BEAM_STEP).astype(np.int64)
+    beams = np.floor(elevation_angles(points) / BEAM_STEP).astype(np.int64)
     first = beams.min(initial=0)
     offsets = rng.normal(0, beam, int(beams.max(initial=0) - first) + 1)
     shift = offsets[beams - first] + rng.normal(0, point, len(points))

@@ -9,7 +9,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from lidar_perception.classes import CAR, CYCLIST, PEDESTRIAN
-from lidar_perception.geometry import bev_iou, within
+from lidar_perception.geometry import bev_iou, is_within
 from lidar_perception.training.augment import (
     BOX_MARGIN_M,
     TrainingScene,
@@ -163,7 +163,7 @@ def _draw_turn(box: np.ndarray, free: np.ndarray, low: np.ndarray, high: np.ndar
     turns = rng.uniform(-np.pi, np.pi, MAX_DIRECTIONS)
     angles = np.arctan2(box[1], box[0]) + turns
     centres = np.stack([distance * np.cos(angles), distance * np.sin(angles)], axis=1)
-    fits = within(centres, low, high)
+    fits = is_within(centres, low, high)
     for aside in (-half, 0.0, half):
         fits &= free[_to_sectors(angles + aside / max(distance, half))] > distance + half
     return float(turns[fits.argmax()]) if fits.any() else None

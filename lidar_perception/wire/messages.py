@@ -11,8 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from lidar_perception.camera import Calibration, Camera
 from lidar_perception.classes import CALLED
-from lidar_perception.groups import renumbered
-from lidar_perception.intensity import INTENSITY_FIELDS, full_scale, scale_problem, to_unit
+from lidar_perception.groups import renumber_ids
+from lidar_perception.intensity import (
+    INTENSITY_FIELDS,
+    find_scale_problem,
+    infer_full_scale,
+    to_unit,
+)
 from lidar_perception.robot import poses
 from lidar_perception.types import (
     CLASSES,
@@ -33,7 +38,7 @@ FullScale = Callable[[np.ndarray, DTypeLike], float]  # see intensity.full_scale
 
 
 def to_frame(msg: Any, intensity_max: float | None = None,
-             scale: FullScale = full_scale) -> tuple[LidarFrame, np.ndarray]:
+             scale: FullScale = infer_full_scale) -> tuple[LidarFrame, np.ndarray]:
     """Convert a PointCloud2 to a LidarFrame of its usable points.
 
     If the cloud has a column `in_view`, points where it is 0 are left out.
@@ -100,7 +105,7 @@ def read_raw_intensity(msg: Any) -> tuple[np.ndarray, np.dtype] | None:
 
 def diagnose_intensity(frame: LidarFrame) -> str | None:
     """Return a message if the intensity scale of a frame is implausible, else None."""
-    return scale_problem(frame.intensity)
+    return find_scale_problem(frame.intensity)
 
 
 def diagnose_recorded_intensity(source: Any, clouds: Sequence[LidarFrame]) -> str | None:
@@ -111,7 +116,7 @@ def diagnose_recorded_intensity(source: Any, clouds: Sequence[LidarFrame]) -> st
         clouds: a sample of its clouds, judged together.
     """
     intensities = [cloud.intensity for cloud in clouds if cloud.intensity is not None]
-    problem = scale_problem(np.concatenate(intensities)) if intensities else None
+    problem = find_scale_problem(np.concatenate(intensities)) if intensities else None
     return problem and (f"{source}: {problem}; for a bag or cloud files, set it with "
                         "convert --robot")
 
@@ -165,7 +170,7 @@ def read_cluster_ids(msg: Any, indices: np.ndarray) -> tuple[np.ndarray, np.ndar
         InputError: the column does not hold ids.
     """
     ids = read_column(msg, "cluster_id", indices)
-    return None if ids is None else renumbered(ids)
+    return None if ids is None else renumber_ids(ids)
 
 
 def _single(points: np.ndarray, name: str) -> np.ndarray:
@@ -187,14 +192,14 @@ def read_calibration(info: Any, transform: Any) -> Calibration:
         InputError: P is empty, or the frame names of the two messages do not match.
     """
     t, q = transform.transform.translation, transform.transform.rotation
-    lidar_to_camera = poses.pose_of(*poses.checked(
+    lidar_to_camera = poses.make_pose(*poses.check_pose(
         (t.x, t.y, t.z), (q.x, q.y, q.z, q.w), "the LiDAR-to-camera transform"))
     parent, child = transform.header.frame_id, transform.child_frame_id
     if info.header.frame_id != parent:  # it is the camera's pose in the LiDAR frame: invert it
         if info.header.frame_id != child:
             raise InputError(f"CameraInfo is in frame '{info.header.frame_id}' but the transform "
                              f"links '{parent}' and '{child}'")
-        lidar_to_camera = poses.inverse(lidar_to_camera)
+        lidar_to_camera = poses.invert_pose(lidar_to_camera)
     return make_calibration(info, lidar_to_camera)
 
 
@@ -318,4 +323,4 @@ def read_pose(pose: Any) -> np.ndarray:
     Raises InputError if it is not finite, or its quaternion is not of length 1.
     """
     p, q = pose.position, pose.orientation
-    return poses.pose_of(*poses.checked((p.x, p.y, p.z), (q.x, q.y, q.z, q.w), "a pose"))
+    return poses.make_pose(*poses.check_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w), "a pose"))

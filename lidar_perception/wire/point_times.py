@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidar_perception.robot.deskew import Poses, deskewed
+from lidar_perception.robot.deskew import PoseLookup, deskew
 from lidar_perception.types import InputError, LidarFrame
 from msg_utils.point_cloud2 import CloudError, add_columns, to_array
 from msg_utils.stamps import SECOND, to_ns
@@ -91,7 +91,7 @@ def _unit_ns(span: float, is_integer: bool, low: float) -> int:
     return 1 if is_integer else 10**9  # a cloud shorter than SWEEP_S
 
 
-def deskew_points(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: Poses
+def deskew_points(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: PoseLookup
                   ) -> tuple[np.ndarray, np.ndarray, PointTimes] | None:
     """Move the points of a frame to where they are seen from the sensor's pose at the stamp.
 
@@ -114,12 +114,12 @@ def deskew_points(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: Poses
     if len(timed) < len(frame):
         times = times._replace(seconds=times.seconds.take(timed))
         xyz = xyz.take(timed, axis=0)
-    moved = deskewed(xyz, times.seconds, lambda seconds: poses(
+    moved = deskew(xyz, times.seconds, lambda seconds: poses(
         frame.stamp_ns + np.rint(seconds * SECOND).astype(np.int64)))
     return timed, moved, times
 
 
-def deskew_frame(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: Poses) -> LidarFrame:
+def deskew_frame(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: PoseLookup) -> LidarFrame:
     """Return the frame with its points moved to its stamp, see deskew_points.
 
     Points without a time stay where they are.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from lidar_perception.robot.tree import TransformTree
+from lidar_perception.robot.transform_tree import TransformTree
 from lidar_perception.types import InputError
 from msg_utils.stamps import to_ns
 

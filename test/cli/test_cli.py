@@ -28,7 +28,7 @@ from lidar_perception.cli.options import detector_options, read_config
 from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.open import DetectorChoice
-from lidar_perception.param_fields import parameter_fields, with_values
+from lidar_perception.param_fields import collect_fields, with_values
 from lidar_perception.runs.terminal import Terminal
 from lidar_perception.scoring.tables import narrow_table
 from lidar_perception.types import InputError, closest_name
@@ -123,7 +123,7 @@ def test_set_help_lists_the_parameters_of_what_runs(words, names):
 def test_set_help_of_candidates_describes_every_parameter():
     text = run("evaluate", "candidates", "--set", "help")
     assert all(f"{name} (default" in text and f.metadata["doc"] in text
-               for name, f in parameter_fields(PAPER).items() if not name.startswith("input."))
+               for name, f in collect_fields(PAPER).items() if not name.startswith("input."))
 
 
 def test_convert_makes_a_bag_of_every_scan(kitti, bag):

@@ -22,8 +22,8 @@ from lidar_perception.data.bag_poses import FILTERED, odometry_topic
 from lidar_perception.data.frame import POSES
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.robot.placing import tilted
-from lidar_perception.robot.poses import inverse
+from lidar_perception.robot.placement import make_tilted_pose
+from lidar_perception.robot.poses import invert_pose
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_odometry
@@ -58,10 +58,10 @@ def test_odometry_of_the_sensor_itself_or_of_what_tf_does_not_know_is_the_sensor
 
 def test_odometry_of_another_part_of_the_robot_is_carried_to_the_sensor(tmp_path):
     """As of an inertial sensor beside it, or of a base_footprint below the base."""
-    imu = tilted(0.1, 0.2, 0.3)
+    imu = make_tilted_pose(0.1, 0.2, 0.3)
     beside = [(TF_STATIC, TF_MESSAGE, START, tf(transform("base_link", "imu", 0, imu)))]
     check(recorded(tmp_path / "bag", moving(ODOMETRY, "imu"), mount(), beside),
-          inverse(imu) @ ON_BASE)
+          invert_pose(imu) @ ON_BASE)
 
 
 def test_clouds_in_the_frame_of_the_odometry_do_not_move(tmp_path):

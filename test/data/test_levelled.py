@@ -11,7 +11,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.robot.poses import inverse, pose_of
+from lidar_perception.robot.poses import invert_pose, make_pose
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.types import GroundTruth, LidarFrame
 from lidar_perception.wire.messages import to_frame
@@ -39,7 +39,7 @@ CAMERA = Calibration(np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0
 
 def pose(i):
     """Of a level sensor on its way."""
-    return pose_of([2.0 * i, 0.1 * i, 0.9], Rotation.from_euler("z", 0.1 * i).as_quat())
+    return make_pose([2.0 * i, 0.1 * i, 0.9], Rotation.from_euler("z", 0.1 * i).as_quat())
 
 
 def leaning():
@@ -95,7 +95,7 @@ WORLD = np.random.default_rng(1).uniform(-20, 20, (400, 3)) + [1, 0, 0]
 def in_motion(stamp):
     """The cloud of a turn of 0.1 s, of things that stand."""
     seconds = np.linspace(0, 0.1, len(WORLD))
-    seen = [inverse(base_at(stamp + t * 1e9) @ ON_BASE) @ [*point, 1]
+    seen = [invert_pose(base_at(stamp + t * 1e9) @ ON_BASE) @ [*point, 1]
             for point, t in zip(WORLD, seconds)]
     return cloud_message(np.array(seen)[:, :3], stamp, "lidar", time=seconds.astype(np.float32))
 
@@ -106,7 +106,7 @@ def test_a_bags_clouds_are_moved_to_their_stamps(moves, tmp_path, monkeypatch):
     assert exit_of(monkeypatch, "convert", tmp_path / "robot", "--deskew", "--out",
                    tmp_path / "still") == 0
     for i, frame in enumerate(open_recording(tmp_path / "still")):
-        there = inverse(base_at(stamps()[i]) @ ON_BASE)
+        there = invert_pose(base_at(stamps()[i]) @ ON_BASE)
         expected = WORLD @ there[:3, :3].T + there[:3, 3]
         np.testing.assert_allclose(frame.load().xyz, expected, atol=0.01)
         blurred = to_frame(in_motion(stamps()[i]))[0].xyz

@@ -22,7 +22,7 @@ from lidar_perception.labels.datasets import write_dataset
 from lidar_perception.labels.drive_labels import DriveLabels, of_truth
 from lidar_perception.labels.exchange import export_labels
 from lidar_perception.labels.formats import bag as bag_format
-from lidar_perception.robot.poses import inverse, moved_boxes
+from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.simulation.sensor import generic
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.testing.clouds import cloud_message
@@ -240,7 +240,7 @@ def test_boxes_in_another_frame_are_brought_to_that_of_the_clouds(parts, tmp_pat
     labels = bag_format.read(tmp_path / "bag", frames, "/n/output/detections")
     shown = results.recorded(poses, stamps())
     for i, (frame, each) in enumerate(zip(frames, labels.frames)):
-        near = moved_boxes(boxes, inverse(base_at(frame.stamp_ns) @ ON_BASE))
+        near = transform_boxes(boxes, invert_pose(base_at(frame.stamp_ns) @ ON_BASE))
         np.testing.assert_allclose(each.boxes, near, atol=1e-3)
         np.testing.assert_allclose(shown.sources["n"].find(i, frame).boxes, near, atol=1e-3)
         np.testing.assert_allclose(shown.tracks[0]["boxes"][i][1:8], near[0], atol=1e-3)

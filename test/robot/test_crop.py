@@ -1,4 +1,4 @@
-"""The crop: its limits as laws, and the same points left out wherever it is applied."""
+"""Crop of a cloud by range, body and sectors."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment_cloud
 from lidar_perception.param_fields import with_values
-from lidar_perception.robot.crop import cropped, kept_points
+from lidar_perception.robot.crop import crop_frame, select_points
 from lidar_perception.robot.params import CropParams
-from lidar_perception.robot.placing import levelling, tilted
-from lidar_perception.robot.poses import inverse, moved_points
+from lidar_perception.robot.placement import find_level_transform, make_tilted_pose
+from lidar_perception.robot.poses import invert_pose, transform_points
 from lidar_perception.types import LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_frame
@@ -25,16 +25,16 @@ BODY = (-1.0, -0.6, -1.7, 2.0, 0.6, 0.2)
 CROP = CropParams(body=BODY, min_range=1.0, max_range=15.0, sectors=(170.0, 190.0, -60.0, -45.0))
 
 
-def points(count=5000, seed=0):
+def make_points(count=5000, seed=0):
     rng = np.random.default_rng(seed)
     return (rng.uniform(-20, 20, (count, 3)) * rng.uniform(0, 1, (count, 1))).astype(np.float32)
 
 
-def plainly_kept(point, params):
-    """The law, point by point."""
+def is_kept(point, params):
+    """Return True if a plain implementation keeps the point."""
     x, y, z = map(float, point)
-    far = np.sqrt(x * x + y * y + z * z)
-    if far < params.min_range or (params.max_range and far > params.max_range):
+    distance = np.sqrt(x * x + y * y + z * z)
+    if distance < params.min_range or (params.max_range and distance > params.max_range):
         return False
     low, high = params.body[:3], params.body[3:]
     if params.body and all(a < v < b for a, v, b in zip(low, (x, y, z), high)):
@@ -50,77 +50,75 @@ def plainly_kept(point, params):
     CropParams(), CropParams(body=BODY), CropParams(min_range=5.0), CropParams(max_range=5.0),
     CropParams(sectors=(350.0, 370.0)), CropParams(sectors=(-190.0, -170.0, 30.0, 31.0)),
     CropParams(sectors=(0.0, 360.0)), CROP])
-def test_what_is_kept_is_what_a_plain_look_at_each_point_keeps(params):
-    xyz = points()
-    expected = [plainly_kept(p, params) for p in xyz]
-    np.testing.assert_array_equal(kept_points(xyz, params), expected)
+def test_crop_equals_a_plain_implementation(params):
+    xyz = make_points()
+    expected = [is_kept(p, params) for p in xyz]
+    np.testing.assert_array_equal(select_points(xyz, params), expected)
     if params.enabled:
         assert 0 < len(xyz) - sum(expected)
 
 
 @given(st.integers(0, 1000), st.floats(-180, 180))
-def test_a_turned_sector_keeps_the_turned_points(seed, angle):
-    xyz = points(200, seed).astype(np.float64)
-    turned = Rotation.from_euler("z", angle, degrees=True).apply(xyz)
+def test_a_rotated_sector_keeps_the_rotated_points(seed, angle):
+    xyz = make_points(200, seed).astype(np.float64)
+    rotated = Rotation.from_euler("z", angle, degrees=True).apply(xyz)
     edges = np.array([20.0, 75.0])
     near = np.abs((np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))[:, None] - edges + 180) % 360
                   - 180).min(axis=1) < 1e-6
-    before = kept_points(xyz, CropParams(sectors=tuple(edges)))
-    after = kept_points(turned, CropParams(sectors=tuple(edges + angle)))
+    before = select_points(xyz, CropParams(sectors=tuple(edges)))
+    after = select_points(rotated, CropParams(sectors=tuple(edges + angle)))
     np.testing.assert_array_equal(before[~near], after[~near])
 
 
-def test_the_body_is_a_box_of_the_base_frame_where_its_pose_is_known():
+def test_the_body_is_a_box_in_the_base_frame():
     base = np.eye(4)
     base[:3, :3] = Rotation.from_euler("zyx", [2.0, 0.4, -0.3]).as_matrix()
     base[:3, 3] = 0.5, -0.2, 1.1
-    xyz = points().astype(np.float64)
-    np.testing.assert_array_equal(kept_points(xyz, CropParams(body=BODY), base),
-                                  kept_points(xyz @ base[:3, :3].T + base[:3, 3],
-                                              CropParams(body=BODY)))
+    xyz = make_points().astype(np.float64)
+    np.testing.assert_array_equal(select_points(xyz, CropParams(body=BODY), base),
+                                  select_points(xyz @ base[:3, :3].T + base[:3, 3],
+                                                CropParams(body=BODY)))
 
 
 @pytest.mark.parametrize("roll, pitch, ahead", [(0, 0, 180), (180, 0, 0), (15, -20, 90)])
-def test_sectors_are_of_the_robot_however_its_sensor_is_mounted(roll, pitch, ahead):
-    """What a level sensor that looks ahead keeps, the same points seen by a turned one are."""
-    level = levelling(tilted(*np.radians([roll, pitch])), np.radians(ahead))
-    straight = points().astype(np.float64)
+def test_sectors_do_not_depend_on_the_mounting(roll, pitch, ahead):
+    level = find_level_transform(make_tilted_pose(*np.radians([roll, pitch])), np.radians(ahead))
+    straight = make_points().astype(np.float64)
     params = CropParams(sectors=(150.0, 210.0, 60.0, 90.0), min_range=2.0)
     np.testing.assert_array_equal(
-        kept_points(moved_points(straight, inverse(level)), params, level=level),
-        kept_points(straight, params))
+        select_points(transform_points(straight, invert_pose(level)), params, level=level),
+        select_points(straight, params))
 
 
-def test_without_a_crop_the_frame_is_the_same_object():
-    frame = LidarFrame(points())
-    indices, same = cropped(frame, CropParams())
+def test_a_disabled_crop_returns_the_same_frame():
+    frame = LidarFrame(make_points())
+    indices, same = crop_frame(frame, CropParams())
     assert same is frame and indices.tolist() == list(range(len(frame)))
 
 
-def test_the_pipeline_sees_what_is_left_of_the_whole_cloud():
-    """Cropped by the pipeline, and before it, the result is the same, with indices into what was
-    given; and a crop that was done does nothing the second time."""
+def test_cropping_in_and_before_the_pipeline_is_the_same():
+    """Indices refer to the given cloud, and a second crop removes nothing."""
     frame = LidarFrame(np.ascontiguousarray(scene()[:, :3]))
     params = with_values(PipelineParams(), {"crop.min_range": 4.0, "crop.sectors": (90.0, 270.0)})
-    kept, before = cropped(frame, params.crop)
+    kept, before = crop_frame(frame, params.crop)
     assert 0 < len(kept) < len(frame)
     whole, part = segment_cloud(frame, params=params), segment_cloud(before)
     np.testing.assert_array_equal(whole.indices, kept.take(part.indices))
     for name in ("xyz", "ground", "cluster_ids", "boxes"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(part, name))
-    assert len(cropped(before, params.crop)[0]) == len(before)
+    assert len(crop_frame(before, params.crop)[0]) == len(before)
 
 
-def test_the_cropped_points_of_a_cloud_are_those_of_its_frame():
+def test_a_cropped_message_has_the_points_of_a_cropped_frame():
     cloud = np.zeros(300, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
     for i, name in enumerate("xyz"):
-        cloud[name] = points(300)[:, i]
+        cloud[name] = make_points(300)[:, i]
     cloud["x"][::7] = np.nan
     frame, usable = to_frame(from_array(cloud, header(bag_message), bag_message))
-    kept, _ = cropped(frame, CROP)
+    kept, _ = crop_frame(frame, CROP)
     finite = np.isfinite(cloud["x"])
     np.testing.assert_array_equal(usable.take(kept), np.flatnonzero(
-        finite & kept_points(points(300), CROP)))
+        finite & select_points(make_points(300), CROP)))
 
 
 @pytest.mark.parametrize("values, words", [
@@ -130,6 +128,6 @@ def test_the_cropped_points_of_a_cloud_are_those_of_its_frame():
     ({"sectors": (1.0,)}, "pairs"),
     ({"min_range": 5.0, "max_range": 4.0}, "below min_range"),
 ])
-def test_a_crop_that_cannot_be_is_refused_with_the_remedy(values, words):
+def test_an_invalid_crop_is_refused_with_the_remedy(values, words):
     with pytest.raises(ValueError, match=words):
         CropParams(**values)

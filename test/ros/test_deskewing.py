@@ -10,7 +10,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 from test_robot_frames import PERIOD, START, give, message, mounted, odometry, problems, transforms
 
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
-from lidar_perception.robot.deskew import skewed, steady
+from lidar_perception.robot.deskew import make_constant_motion, skew
 from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.messages import read_column, to_frame
 from msg_utils.point_cloud2 import to_array
@@ -21,7 +21,8 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def drive(at_ns):
     """The base's pose in odom: 15 m/s on a left turn."""
-    return steady([15.0, 0.0, 0.0], [0.0, 0.0, 0.5])(np.array([(at_ns - START) * 1e-9]))[0]
+    return make_constant_motion([15.0, 0.0, 0.0],
+                                [0.0, 0.0, 0.5])(np.array([(at_ns - START) * 1e-9]))[0]
 
 
 @pytest.mark.parametrize("source", ["odometry", "tf"])
@@ -37,7 +38,7 @@ def test_a_cloud_of_a_moving_sensor_is_moved_to_its_stamp(start, source):
 
     def poses(at):
         return np.array([drive(START + round(s * 1e9)) @ sensor for s in at])
-    raw = skewed(still, seconds, poses)
+    raw = skew(still, seconds, poses)
     raw[body] = still[body]
     node = start(GroundSegmentation, **{
         "input.deskew": source, "base_frame": "base",

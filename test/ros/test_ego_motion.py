@@ -19,8 +19,8 @@ from lidar_perception.nodes.ego import ICP_MS
 from lidar_perception.nodes.perception import Perception
 from lidar_perception.nodes.runtime import MARKERS
 from lidar_perception.nodes.tracker import TrackerNode
-from lidar_perception.robot.poses import inverse, moved_boxes
-from lidar_perception.robot.tree import Missing
+from lidar_perception.robot.poses import invert_pose, transform_boxes
+from lidar_perception.robot.transform_tree import MissingTransform
 from lidar_perception.tracking.ego import has_odometry
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, Detections
@@ -51,7 +51,8 @@ def drive(node, tell, poses, frame_id="lidar"):
     for i, (found, at) in enumerate(zip(crowd(frames=len(poses)), poses)):
         stamp = START + i * TENTH
         tell(i, stamp)
-        seen = Detections.of(moved_boxes(found.boxes, inverse(at)), found.class_ids, found.scores)
+        seen = Detections.of(transform_boxes(found.boxes, invert_pose(at)), found.class_ids,
+                             found.scores)
         node.on_markers(make_detection_markers(seen, header(stamp, frame_id), bag_message))
         tracks, shown = library(seen, stamp, at), tracked(node)
         assert shown.ids.tolist() == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
@@ -242,7 +243,7 @@ def test_odometry_that_does_not_say_what_it_is_of_is_named_and_turns_no_cloud(st
     drive(node, lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp, "")),
           [base_at(i) for i in range(10)])
     assert "child_frame_id is empty" in node.state[1]
-    with pytest.raises(Missing, match="child_frame_id"):
+    with pytest.raises(MissingTransform, match="child_frame_id"):
         node.transforms.sensor_poses("odometry", "lidar", np.array([START]))
 
 
@@ -259,7 +260,7 @@ def test_poses_of_the_scans_are_carried_to_the_frame_of_the_detections(start):
     assert "TF does not connect them" in ego.problem("base", START)
     node.transforms.on_tf(transforms(("base", "lidar", rear, 0)), static=True)
     np.testing.assert_allclose(ego.pose(header(START, "base")),
-                               ego.pose(header(START)) @ inverse(rear), atol=1e-6)
+                               ego.pose(header(START)) @ invert_pose(rear), atol=1e-6)
     assert ego.problem("base", START) is None
     for late in (0, 1):  # once more, or between two drivers' queues: the map stays
         ego._on_cloud(message(xyz, START + (2 - late) * TENTH))

@@ -17,7 +17,7 @@ from test_robot_frames import mounted, transforms
 
 from lidar_perception.nodes.graph import SINGLE
 from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, has_tf
-from lidar_perception.robot.poses import moved_boxes
+from lidar_perception.robot.poses import transform_boxes
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import to_detections
 from lidar_perception.wire.transforms import TF_MESSAGE
@@ -146,7 +146,7 @@ def test_boxes_in_another_frame_are_shown_where_tf_says(looking, heard, shared_p
         if len(heard) > sent:
             sent, found = len(heard), from_marker_array(heard[-1])
             talker.publish(encode(to_marker_array(
-                moved_boxes(found.boxes, place), found.labels, found.scores, make=bag_message,
+                transform_boxes(found.boxes, place), found.labels, found.scores, make=bag_message,
                 header=header_message(found.stamp_ns, "base", bag_message))))
 
     def lines():

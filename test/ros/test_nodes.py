@@ -22,7 +22,7 @@ from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.inputs import Paired
 from lidar_perception.nodes.perception import Perception
 from lidar_perception.nodes.runtime import ERROR, LATCHED, OK, WARN
-from lidar_perception.param_fields import flatten, parameter_fields
+from lidar_perception.param_fields import collect_fields, flatten
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.wire.codec import bag_message
 from msg_utils.markers import from_marker_array
@@ -64,7 +64,7 @@ def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
     peer = shared_peer
     names = set(peer.call("/perception/list_parameters", ListParameters,
                           ListParameters.Request()).result.names)
-    fields, defaults = parameter_fields(PipelineParams()), flatten(PipelineParams())
+    fields, defaults = collect_fields(PipelineParams()), flatten(PipelineParams())
     assert set(fields) <= names
     request = GetParameters.Request(names=list(fields))
     values = peer.call("/perception/get_parameters", GetParameters, request).values

@@ -22,8 +22,8 @@ from lidar_perception.nodes.perception import Perception
 from lidar_perception.nodes.pointpillars_detector import PointPillarsNode
 from lidar_perception.nodes.transforms import NO_TF
 from lidar_perception.param_fields import flatten, with_values
-from lidar_perception.robot.placing import tilted
-from lidar_perception.robot.poses import inverse, moved_points
+from lidar_perception.robot.placement import make_tilted_pose
+from lidar_perception.robot.poses import invert_pose, transform_points
 from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.messages import to_detections
 from msg_utils.markers import from_marker_array
@@ -92,7 +92,7 @@ def walker(base):
     """The scene of samples.py on a floor at z = 0 of the base, as a sensor mounted there sees it;
     and where its person is in the base."""
     on_floor = walker_scene()[:, :3].astype(np.float64) + [0, 0, 1.7]
-    return moved_points(on_floor, inverse(base)), WALKER[:3] + [0, 0, 1.7]
+    return transform_points(on_floor, invert_pose(base)), WALKER[:3] + [0, 0, 1.7]
 
 
 @pytest.mark.parametrize("tilt", TILTS)
@@ -106,7 +106,7 @@ def test_candidates_of_a_tilted_sensor_are_those_of_a_level_one(start, tilt):
         node.transforms.on_tf(transforms(("base", "lidar", base, 0), ("base", "eye", camera, 0)),
                               static=True)
         xyz, person = walker(base)
-        at = moved_points(person[None], inverse(camera))[0].tolist()
+        at = transform_points(person[None], invert_pose(camera))[0].tolist()
         node.seed._on_click(bag_message(
             "geometry_msgs/msg/PointStamped", header=header_message(START, "eye", bag_message),
             point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at)))))
@@ -134,8 +134,8 @@ def test_a_network_sees_a_tilted_sensors_cloud_as_a_level_ones(start, weights):
     boxes by parameters entered by hand; without a target they are in the cloud's frame."""
     scan = frame()
     place = mounted(0.7, -0.3, 1.73, 0.2, 0.0, 0.0)
-    tilt = tilted(-0.2, 0.3)
-    seen = moved_points(scan.xyz.astype(np.float64), inverse(tilt))
+    tilt = make_tilted_pose(-0.2, 0.3)
+    seen = transform_points(scan.xyz.astype(np.float64), invert_pose(tilt))
     level = start(PointPillarsNode, target_frame="base", **weights)
     level.transforms.on_tf(transforms(("base", "lidar", place, 0)), static=True)
     give(level, message(scan.xyz, intensity=scan.intensity))
@@ -149,7 +149,7 @@ def test_a_network_sees_a_tilted_sensors_cloud_as_a_level_ones(start, weights):
         assert frame_id == name and len(detections) == len(expected)
         boxes = detections.boxes.astype(np.float64)
         if name == "lidar":
-            boxes[:, :3] = moved_points(boxes[:, :3], place @ tilt)
+            boxes[:, :3] = transform_points(boxes[:, :3], place @ tilt)
             by_hand = start(PointPillarsNode, **{
                 **weights, "ground.sensor_pose.roll": -0.2, "ground.sensor_pose.pitch": 0.3})
             give(by_hand, message(seen, intensity=scan.intensity))
@@ -173,9 +173,9 @@ def test_the_detectors_look_ahead_wherever_x_of_the_clouds_looks(start, weights,
     plain = start(PointPillarsNode, **weights)
     give(plain, message(scan.xyz, intensity=scan.intensity))
     expected, _, _ = boxes_of(plain)
-    tilt = np.eye(4) if by == "nothing" else tilted(-0.2, 0.3)
-    level = inverse(mounted(0, 0, 0, np.radians(ahead), 0, 0)) @ tilt
-    seen = moved_points(scan.xyz.astype(np.float64), inverse(level))
+    tilt = np.eye(4) if by == "nothing" else make_tilted_pose(-0.2, 0.3)
+    level = invert_pose(mounted(0, 0, 0, np.radians(ahead), 0, 0)) @ tilt
+    seen = transform_points(scan.xyz.astype(np.float64), invert_pose(level))
     leans = {"hand": {"ground.sensor_pose.roll": -0.2, "ground.sensor_pose.pitch": 0.3},
              "TF": {"base_frame": "base"}, "nothing": {}}[by]
     node = start(PointPillarsNode, **{**weights, **leans, "input.ahead": ahead})
@@ -187,7 +187,7 @@ def test_the_detectors_look_ahead_wherever_x_of_the_clouds_looks(start, weights,
     assert frame_id == "lidar" and len(found) == len(expected) > 5
     assert node.counts["cropped"] == plain.counts["cropped"]
     back = found.boxes.astype(np.float64)
-    back[:, :3] = moved_points(back[:, :3], level)
+    back[:, :3] = transform_points(back[:, :3], level)
     order, other = (np.lexsort(b[:, 1::-1].round(1).T) for b in (back, expected.boxes))
     np.testing.assert_allclose(back[order][:, :6], expected.boxes[other][:, :6], atol=2e-2)
     if by == "nothing":
@@ -198,8 +198,8 @@ def test_the_detectors_look_ahead_wherever_x_of_the_clouds_looks(start, weights,
 def test_a_click_and_candidates_are_where_they_are_in_a_turned_cloud(start):
     turn = mounted(0, 0, 0, np.radians(-100), 0, 0)
     node = start(Perception, **WALKING, **{"input.ahead": -100.0})
-    xyz, person = moved_points(walker_scene()[:, :3].astype(np.float64), turn), WALKER[:3]
-    at = moved_points(np.array(person, np.float64)[None], turn)[0]
+    xyz, person = transform_points(walker_scene()[:, :3].astype(np.float64), turn), WALKER[:3]
+    at = transform_points(np.array(person, np.float64)[None], turn)[0]
     node.seed._on_click(bag_message(
         "geometry_msgs/msg/PointStamped", header=header_message(START, "lidar", bag_message),
         point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at.tolist())))))
@@ -236,7 +236,8 @@ def test_the_body_is_cropped_only_where_the_frame_that_it_is_given_in_is_known(s
         "crop.body": [-0.5, -0.4, 0.2, 0.5, 0.4, 1.0]})
     floor = np.random.default_rng(0).uniform(-20, 20, (2000, 3)) * [1, 1, 0]
     sensor = mounted(0.5, 0.0, 1.2, 0.0, 0.0, 0.0)  # the base's origin is behind it
-    seen = moved_points(np.vstack([floor, [[0.3, 0.0, 0.8]], [[0.9, 0.0, 0.8]]]), inverse(sensor))
+    seen = transform_points(np.vstack([floor, [[0.3, 0.0, 0.8]], [[0.9, 0.0, 0.8]]]),
+                            invert_pose(sensor))
     give(node, message(seen))
     assert not node.counts["cropped"] and "crop.body is not left out" in problems(node)
     node.transforms.on_tf(transforms(("base", "lidar", sensor, START)), static=True)
@@ -289,15 +290,15 @@ def test_a_cloud_waits_for_a_transform_that_is_late_or_that_never_came(start):
 
 def test_tracks_of_a_tilted_sensor_stay_in_the_clouds_frame(start, weights):
     """Where its detections are in the base, its tracks are in the cloud."""
-    scan, tilt = frame(), tilted(-0.2, 0.3, 1.73)
+    scan, tilt = frame(), make_tilted_pose(-0.2, 0.3, 1.73)
     node = start(PointPillarsNode, **{**weights, "base_frame": "base", "target_frame": "base",
                                       "tracking.enabled": True, "tracking.report": 0.0})
     node.transforms.on_tf(transforms(("base", "lidar", tilt, 0)), static=True)
-    seen = moved_points(scan.xyz.astype(np.float64), tilted(-0.2, 0.3).T)
+    seen = transform_points(scan.xyz.astype(np.float64), make_tilted_pose(-0.2, 0.3).T)
     for i in range(4):
         give(node, message(seen, START + i * PERIOD, scan.intensity))
     (found, base, _), (tracks, cloud, _) = boxes_of(node), boxes_of(node, "tracks")
     assert (base, cloud) == ("base", "lidar") and len(found) and len(tracks)
-    centres = moved_points(tracks.boxes[:, :3].astype(np.float64), tilt)
+    centres = transform_points(tracks.boxes[:, :3].astype(np.float64), tilt)
     apart = np.linalg.norm(centres[:, None] - found.boxes[None, :, :3], axis=2).min(axis=1)
     assert np.median(apart) < 0.3

@@ -10,9 +10,9 @@ import pytest
 from tilted_samples import clouds_of
 
 from lidar_perception.data.raw_clouds import _of_frame
-from lidar_perception.robot.crop import kept_points
+from lidar_perception.robot.crop import select_points
 from lidar_perception.robot.params import CropParams
-from lidar_perception.robot.placing import tilted
+from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.sensor_setup.coverage import stands_still
 from lidar_perception.sensor_setup.doubts import doubts
 from lidar_perception.sensor_setup.files import node_params, params_yaml
@@ -97,11 +97,11 @@ def test_the_robots_body_is_found_and_left_out():
     assert len(of(all_changed(None)).coverage.box) == 0
     # In robot.param.yaml also as it is with base_frame, whether TF has that or the ground only.
     own = m.scans[0].xyz[np.hypot(*m.scans[0].xyz[:, :2].T) < 1.0]
-    by_tf = m.told._replace(footprint=tilted(0.1, -0.2, 0.9))
-    for told, base in ((m.told, tilted(m.mount.roll, m.mount.pitch, m.mount.height)),
+    by_tf = m.told._replace(footprint=make_tilted_pose(0.1, -0.2, 0.9))
+    for told, base in ((m.told, make_tilted_pose(m.mount.roll, m.mount.pitch, m.mount.height)),
                        (by_tf, by_tf.footprint)):
         (line,) = re.findall(r"# body: (.*)", params_yaml(replace(m, told=told)))
-        assert kept_points(own, CropParams(body=tuple(json.loads(line))), base).mean() < 0.02
+        assert select_points(own, CropParams(body=tuple(json.loads(line))), base).mean() < 0.02
 
 
 def seen(half=np.inf, body=0.0, height=0.6, seed=0, turn=np.eye(3)):
@@ -150,7 +150,7 @@ def test_people_who_pass_by_do_not_move_a_robot_that_stands():
     assert stands_still(passed) and stands_still(np.roll(passed, 1, axis=0)[:2]) is not None
     assert stands_still(np.array([np.roll(around, 10 * i, axis=1) for i in range(10)])) is False
     scans = list(seen(body=0.5))
-    poses = {i: tilted(0, 0, 0.6) for i in range(8)}
+    poses = {i: make_tilted_pose(0, 0, 0.6) for i in range(8)}
     parked = measured(scans, range(8), "parked", 8, None, NOTHING._replace(poses=poses))
     assert parked.coverage.still and said(parked, "stands still")
     assert len(parked.coverage.box) and not parked.coverage.blocked
@@ -166,7 +166,7 @@ def test_where_all_is_alike_poses_say_that_the_robot_moved():
     ground = [scan_at(scan.xyz[(scan.xyz[:, 2] < -0.5) | (np.hypot(*scan.xyz[:, :2].T) < 2)])
               for scan in seen(body=1.5)]
     for went, drives in ((0.0, False), (4.0, True)):
-        poses = {i: tilted(0, 0, 0) for i in range(8)}
+        poses = {i: make_tilted_pose(0, 0, 0) for i in range(8)}
         poses[7][0, 3] = went
         m = measured(ground, range(8), "field", 8, None, NOTHING._replace(poses=poses))
         assert (m.coverage.still is False) == drives == m.coverage.fits
@@ -182,7 +182,7 @@ def test_clouds_whose_origin_is_on_the_ground_are_told_and_their_floor_is_no_bod
 
 @pytest.mark.parametrize("roll, pitch", [(0, 28), (180, -10)])
 def test_of_a_sensor_that_leans_the_sky_is_not_blind_and_ground_begins_where_it_does(roll, pitch):
-    lean = tilted(*np.radians([roll, pitch]))[:3, :3]
+    lean = make_tilted_pose(*np.radians([roll, pitch]))[:3, :3]
     m = of(list(seen(turn=lean)), range(8))
     assert np.degrees(m.mount.pitch) == pytest.approx(pitch, abs=0.5) and not m.mount.level
     assert m.coverage.view == (0, 360) and not sensor_of(m).blocked and said(m, "level sensor")

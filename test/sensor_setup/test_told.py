@@ -10,8 +10,8 @@ from robot_bags import ON_BASE, START, base_at, mount, moving, moving_tf, record
 
 from lidar_perception.data.raw_clouds import _of_frame, open_clouds
 from lidar_perception.params import ReceptionParams
-from lidar_perception.robot.placing import tilted
-from lidar_perception.robot.poses import inverse
+from lidar_perception.robot.placement import make_tilted_pose
+from lidar_perception.robot.poses import invert_pose
 from lidar_perception.sensor_setup.doubts import doubts, looks_elsewhere
 from lidar_perception.sensor_setup.files import node_params, params_yaml
 from lidar_perception.sensor_setup.findings import findings
@@ -41,7 +41,7 @@ def on_robot(yaw, roll=0.0, pitch=0.0):
     a = np.radians(yaw)
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
-    pose = turn @ tilted(np.radians(roll), np.radians(pitch))
+    pose = turn @ make_tilted_pose(np.radians(roll), np.radians(pitch))
     pose[:3, 3] = 0.3, -0.1, 1.2
     return pose
 
@@ -53,8 +53,8 @@ def found(told, backwards=False):
 
 def told(poses, actual, said=None, height=None):
     """As from a robot whose base is where the sensor's pose says, if its mount is actual."""
-    return Told("base_link", said, None if height is None else tilted(0, 0, height),
-                {i: pose @ inverse(actual) for i, pose in enumerate(poses)})
+    return Told("base_link", said, None if height is None else make_tilted_pose(0, 0, height),
+                {i: pose @ invert_pose(actual) for i, pose in enumerate(poses)})
 
 
 @pytest.mark.parametrize("yaw", [0, *(pytest.param(yaw, marks=pytest.mark.no_cover)
@@ -104,7 +104,7 @@ def test_many_pairs_of_one_place_are_led_alike_and_no_surer_than_one():
 
 
 def test_pairs_in_which_the_base_turned_or_is_not_known_say_nothing():
-    turned = on_robot(10) @ inverse(on_robot(0))
+    turned = on_robot(10) @ invert_pose(on_robot(0))
     poses = {0: np.eye(4), 1: np.eye(4), 2: turned}
     steps = driven(poses, dict.fromkeys([(0, 1), (0, 2), (0, 7)]))
     assert steps == {(0, 1): (0, 0), (0, 2): None}

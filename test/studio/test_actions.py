@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.geometry import wrap_angle
-from lidar_perception.robot.poses import inverse, moved_boxes
+from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.types import InputError
 from lidar_studio.actions import DO, apply
 from lidar_studio.interpolation import Motion
@@ -155,7 +155,8 @@ def walking(start, velocity, motion, kind=KEY):
     for f, t in enumerate(motion.times):
         fixed = np.array([start[0] + velocity[0] * t, start[1] + velocity[1] * t, -0.9, *SIZE,
                           math.atan2(velocity[1], velocity[0])])
-        box = fixed if motion.poses is None else moved_boxes(fixed, inverse(motion.poses[f]))[0]
+        box = fixed if motion.poses is None else transform_boxes(
+            fixed, invert_pose(motion.poses[f]))[0]
         found[f] = Box.of(box, kind)
     return found
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidar_perception.robot.poses import moved_boxes, moved_points, pose_of
+from lidar_perception.robot.poses import make_pose, transform_boxes, transform_points
 from lidar_perception.types import Detections, InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.topics import TRUTH
@@ -156,10 +156,10 @@ def test_boxes_in_another_frame_are_those_of_the_clouds_once_tf_has_come(live, m
     live.boxes(FOUND, boxes(10 * second), None)
     for i, stamp in enumerate((10 * second, 10 * second + second // 2)):
         live.cloud(cloud(stamp))
-        pose = pose_of(np.array([4.0 * i / 2, 0, 0]), [0, 0, 0, 1]) @ pose_of(mounted, turned)
-        found = Detections.of(moved_boxes(boxes(stamp).boxes, pose), [0], [0.5])
+        pose = make_pose(np.array([4.0 * i / 2, 0, 0]), [0, 0, 0, 1]) @ make_pose(mounted, turned)
+        found = Detections.of(transform_boxes(boxes(stamp).boxes, pose), [0], [0.5])
         tracks = make_track_markers(np.array([3]), found, np.zeros((1, 2)), np.zeros(1),
-                                    [moved_points(trail, pose)],
+                                    [transform_points(trail, pose)],
                                     header_message(stamp, "odom", bag_message), bag_message)
         live.boxes(TRACKED, from_marker_array(tracks), tracks)
         if i:

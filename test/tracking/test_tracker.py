@@ -8,8 +8,8 @@ from tracking_samples import CAR, CYCLIST, START, TENTH, car, cars, crowd, perso
 
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.param_fields import with_values
-from lidar_perception.robot.placing import tilted
-from lidar_perception.robot.poses import moved_boxes
+from lidar_perception.robot.placement import make_tilted_pose
+from lidar_perception.robot.poses import transform_boxes
 from lidar_perception.tracking.association import FORBIDDEN, assigned, costs
 from lidar_perception.tracking.ego import Ego, next_ego, usable
 from lidar_perception.tracking.existence import effective_looks
@@ -63,13 +63,14 @@ def test_the_same_frames_give_the_same_tracks_and_nothing_given_is_changed():
 def test_a_sensor_that_moves_and_turns_sees_the_same_tracks_as_one_that_stands(hung):
     """Upside down, too."""
     frames = list(crowd(1))
-    poses = [pose(0.9 * i, 0.1 * i, 0.04 * i) @ tilted(hung, 0.0) for i in range(len(frames))]
-    moved = [Detections.of(moved_boxes(f.boxes, np.linalg.inv(p)), f.class_ids, f.scores)
+    poses = [pose(0.9 * i, 0.1 * i, 0.04 * i) @ make_tilted_pose(hung, 0.0)
+             for i in range(len(frames))]
+    moved = [Detections.of(transform_boxes(f.boxes, np.linalg.inv(p)), f.class_ids, f.scores)
              for f, p in zip(frames, poses)]
     standing = followed(frames, [np.eye(4)] * len(frames))
     for still, seen, p in zip(standing, followed(moved, poses), poses):
         assert seen.ids.tolist() == still.ids.tolist()
-        back = moved_boxes(seen.detections.boxes, p)
+        back = transform_boxes(seen.detections.boxes, p)
         np.testing.assert_allclose(back[:, :6], still.detections.boxes[:, :6], atol=1e-3)
         assert np.abs(wrap_angle(back[:, 6] - still.detections.boxes[:, 6])).max() < 1e-3
         np.testing.assert_allclose(seen.velocities @ p[:2, :2].T, still.velocities, atol=1e-3)
@@ -285,7 +286,8 @@ def test_the_assignment_makes_most_pairs_within_gates_and_forbids_the_rest():
 def test_parked_cars_seen_from_a_turning_car_without_poses_keep_their_ids():
     """They move sideways in the sensor's frame: nothing may tie their motion to their heading."""
     parked = np.array([car(25, 4), car(32, -6, 0.1), car(40, 5)])
-    frames = [Detections.of(moved_boxes(parked, np.linalg.inv(pose(0.6 * i, 0.0, 0.02 * i))), CAR,
+    frames = [Detections.of(transform_boxes(parked, np.linalg.inv(pose(0.6 * i, 0.0, 0.02 * i))),
+                            CAR,
                             0.9) for i in range(25)]
     tracks = followed(frames)
     assert {tuple(t.ids.tolist()) for t in tracks} == {(1, 2, 3)}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tracking_samples import START, TENTH, car, cars, crowd, pose
 
-from lidar_perception.robot.poses import moved_boxes
+from lidar_perception.robot.poses import transform_boxes
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import TRAIL_POINTS, Trails
 from lidar_perception.types import CLASSES, Detections
@@ -20,7 +20,7 @@ def test_trails_end_at_the_tracks_and_lie_where_they_were(seconds):
     tracker, trails, seen = Tracker(), Trails(), {}
     for i, found in enumerate(crowd(2, 40)):
         at, stamp = pose(0.9 * i, 0.1 * i, 0.03 * i), START + i * TENTH
-        local = Detections.of(moved_boxes(found.boxes, np.linalg.inv(at)), found.class_ids,
+        local = Detections.of(transform_boxes(found.boxes, np.linalg.inv(at)), found.class_ids,
                               found.scores)
         tracks = tracker(local, stamp, at)
         ways = trails(tracks, tracker.pose, stamp, seconds)

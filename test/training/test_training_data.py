@@ -22,7 +22,7 @@ from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.config import RANGES, network_config
 from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED, dense
-from lidar_perception.geometry import within, wrap_angle
+from lidar_perception.geometry import is_within, wrap_angle
 from lidar_perception.simulation import drive
 from lidar_perception.simulation.camera import kitti_labels, turned_camera
 from lidar_perception.simulation.scene import Scenes
@@ -218,7 +218,7 @@ def test_validation_without_camera_keeps_labels_in_range(view):
     source = SimulatedScenes(7, 1, SENSOR, Scenes(None, 3.0, "campus"))
     known = source.frame(0).truth()
     truth = load_validation_frame(config, source, 0).truth()
-    seen = within(known.boxes, config.low, config.high)
+    seen = is_within(known.boxes, config.low, config.high)
     assert np.array_equal(truth.boxes, known.boxes[seen]) and len(truth.extras) == len(truth)
     assert 0 < len(truth) and (len(truth) < len(known) or view == "around")
 

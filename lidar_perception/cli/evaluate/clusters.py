@@ -12,7 +12,7 @@ from lidar_perception.cli.data import Walk, a_path, no_labels, walk_options
 from lidar_perception.cli.options import Runs, Settings, checked, settings_options
 from lidar_perception.detectors.open import POINTNET, default_params, kind_and_file
 from lidar_perception.detectors.pointnet.weights_file import WEIGHTS
-from lidar_perception.param_fields import parameter_fields
+from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.terminal import console
 from lidar_perception.types import InputError
 
@@ -27,7 +27,7 @@ def _file(weights: Path | None) -> Path:
 
 def _runs(weights: Path | None) -> Runs:
     """Ground and clustering, with the parameters that the network was trained with."""
-    fields = parameter_fields(default_params(_file(weights)))
+    fields = collect_fields(default_params(_file(weights)))
     return Runs("ground and clustering", {name: f for name, f in fields.items()
                                  if name.startswith(("ground.", "clustering."))},
                 ("pointnet_detector",))

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from lidar_perception.geometry import points_in_boxes, stable_order
-from lidar_perception.groups import groups_of
+from lidar_perception.geometry import counting_sort, points_in_boxes
+from lidar_perception.groups import group_by_id
 from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
 
 NEAR = (3.0, 6.0, 12.0)  # m: so far around a cluster the ground is looked for
@@ -89,7 +89,7 @@ def clusters_of(frame: LidarFrame, cluster_ids: np.ndarray, min_points: int = 1,
     """The clusters of a frame of N points, with numbers (N,) int, 0 and below for none, that have
     enough points, by their numbers. Without an intensity it is 0. ground (N,) bool: the points
     that say how high the ground is under each; None for a flat one."""
-    groups = groups_of(np.asarray(cluster_ids), min_points)
+    groups = group_by_id(np.asarray(cluster_ids), min_points)
     points = np.zeros((len(groups.rows), 4), np.float32)
     points[:, :3] = frame.xyz[groups.rows]
     if frame.intensity is not None:
@@ -120,7 +120,7 @@ def _ground_under(xyz, xy):
     cell = np.empty(len(xyz), np.int64)
     for i in range(len(xyz)):
         cell[i] = _cell(xyz[i, 0], 0) * CELLS + _cell(xyz[i, 1], 0)
-    order, start = stable_order(cell, CELLS * CELLS, np.arange(len(xyz)))
+    order, start = counting_sort(cell, CELLS * CELLS, np.arange(len(xyz)))
     heights = np.full(len(xy), -SENSOR_HEIGHT)
     for k in range(len(xy)):
         x, y = xy[k]

@@ -19,7 +19,7 @@ from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.detectors.view import levelled_ground
 from lidar_perception.ground.params import GroundParams
-from lidar_perception.groups import renumbered
+from lidar_perception.groups import renumber_ids
 from lidar_perception.types import LidarFrame
 
 MAP_KINDS = ("vehicle", "cyclist", "pedestrian")  # a channel each, however many classes there are
@@ -57,7 +57,7 @@ def network_input(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | 
         points[:, 3] = seen.intensity
     if cluster_ids is None:
         return NetworkInput(points)
-    cluster_ids, _ = renumbered(cluster_ids)
+    cluster_ids, _ = renumber_ids(cluster_ids)
     if config.cluster_ids:
         points[:, 4] = cluster_ids
     return NetworkInput(points, draw_clusters(seen.xyz, cluster_ids, config)

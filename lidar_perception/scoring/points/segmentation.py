@@ -23,7 +23,7 @@ import numpy as np
 
 from lidar_perception.data.semantickitti import GROUND, MOVING, THINGS, UNLABELLED, VEGETATION
 from lidar_perception.geometry import horizontal_range, points_in_box
-from lidar_perception.groups import renumbered
+from lidar_perception.groups import renumber_ids
 from lidar_perception.types import CLASSES, GroundTruth
 
 PROTOCOLS = ("without vegetation", "with vegetation", "vegetation not ground")
@@ -173,7 +173,7 @@ class ClusterScore:
 def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
     """cluster_ids (N,) int, 0 = none; which number a cluster has does not matter, nor does memory
     follow it: of objects and clusters only the pairs that share points are looked at."""
-    labels, numbers = renumbered(cluster_ids)
+    labels, numbers = renumber_ids(cluster_ids)
     ids, owner, region, near = (a.compress(objects.counted).astype(np.int64) for a in (
         labels, objects.owner, objects.region, objects.near))
     size, rows = np.bincount(ids, minlength=len(numbers) + 1), len(objects.classes) + 1

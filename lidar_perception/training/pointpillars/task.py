@@ -41,7 +41,7 @@ from lidar_perception.detectors.pointpillars.targets import (
     sparse,
 )
 from lidar_perception.detectors.view import visible
-from lidar_perception.geometry import within
+from lidar_perception.geometry import is_within
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import track
 from lidar_perception.scoring.detections import Detected, detected
@@ -152,7 +152,7 @@ class ScenePreparation:
         names = [CLASSES[i] for i in scene.class_ids]
         labels = np.array([self._label(CLASS_BY_SIMILAR.get(name, name)) for name in names],
                           np.int64)
-        kept = np.flatnonzero(within(scene.boxes, low, high) & (labels != -1))
+        kept = np.flatnonzero(is_within(scene.boxes, low, high) & (labels != -1))
         counted = [bool(scene.wanted[i]) and names[i] not in CLASS_BY_SIMILAR
                    and labels[i] != DONT_CARE_LABEL
                    and len(find_points_in_box(xyz, scene.boxes[i], 0.0)) >= self.min_points
@@ -238,7 +238,7 @@ def load_validation_frame(config: NetworkConfig, source: Any, i: int) -> Frame:
     frame = source.frame(i)
     truth, calibration = frame.truth(), frame.calibration()
     if calibration is None and truth is not None:
-        kept = np.flatnonzero(within(truth.boxes, config.low, config.high))
+        kept = np.flatnonzero(is_within(truth.boxes, config.low, config.high))
         truth = GroundTruth.of(truth.boxes[kept], truth.class_ids[kept],
                                [truth.extras[k] for k in kept], truth.notes)
     return Frame.of(frame.name, frame.load(), truth, calibration,

@@ -1,0 +1,203 @@
+"""The tree of coordinate frames over time, filled from /tf, /tf_static and odometry."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from lidar_perception.robot.poses import check_pose, interpolate_poses, invert_pose
+from lidar_perception.types import InputError
+
+SECOND_NS = 10**9
+KEPT_NS = 10 * SECOND_NS  # history of each transform, as in tf2
+MAX_KEPT = 10_000         # poses of each transform, at any rate
+MAX_FRAMES = 10_000       # bounds the memory if a publisher makes a new name for every message
+JUMP_NS = SECOND_NS       # a stamp this far before the last one means that a bag started again
+MAX_LAG_S = 10.0          # a longer gap between a stamp and a transform is hardly a lag
+CLOCKS = ("are they stamped by different clocks? Let the driver stamp clouds with the computer's "
+          "time, synchronise the sensor (PTP), or set use_sim_time everywhere")
+
+
+class MissingTransform(InputError):
+    """Two frames are not connected at a time.
+
+    late: the transform may still arrive, because only the newest one is missing.
+    """
+
+    def __init__(self, message: str, late: bool = False):
+        super().__init__(message)
+        self.late = late
+
+
+class _Link:
+    """Pose of a frame in its parent: one static pose, the recent ones, or all of them."""
+
+    def __init__(self, parent: str, static: bool, keeps_all: bool):
+        self.parent, self.static, self.keeps_all = parent, static, keeps_all
+        self.times: list[int] = []  # ns, ascending
+        self.values: list[np.ndarray] = []  # (7,) translation and quaternion
+
+    def add(self, stamp_ns: int, value: np.ndarray) -> None:
+        if self.static:
+            self.times, self.values = [stamp_ns], [value]
+            return
+        place = bisect_right(self.times, stamp_ns)  # a recording may go back in time
+        if place and self.times[place - 1] == stamp_ns:
+            self.values[place - 1] = value
+            return
+        self.times.insert(place, stamp_ns)
+        self.values.insert(place, value)
+        if self.keeps_all:
+            return
+        old = 0
+        while self.times[-1] - self.times[old] > KEPT_NS or len(self.times) - old > MAX_KEPT:
+            old += 1
+        if old > len(self.times) // 10:  # deleting moves the whole list, so not with every message
+            del self.times[:old], self.values[:old]
+
+    def interpolate(self, at: np.ndarray, name: str, max_gap: float | None) -> np.ndarray:
+        """Return poses (M, 4, 4) at times (M,) ns, as TransformTree.lookup_many describes."""
+        chosen = slice(0, 1) if self.static else self._select(int(at.min()), int(at.max()), name,
+                                                              max_gap)
+        values = np.array(self.values[chosen])
+        return interpolate_poses(np.array(self.times[chosen]), values[:, :3], values[:, 3:], at)
+
+    def _select(self, begin: int, end: int, name: str, max_gap: float | None) -> slice:
+        """Select the poses needed from one time to another, in ns.
+
+        Raises:
+            MissingTransform: if they do not cover that time.
+        """
+        times, ago = self.times, (end - self.times[-1]) / SECOND_NS
+        if ago > 0 and (max_gap is None or ago > max_gap or len(times) == 1):
+            why = (f"has its publisher stopped? If not, {CLOCKS}" if ago > MAX_LAG_S else
+                   "is its publisher late, or has it stopped?")
+            raise MissingTransform(f"the newest transform of {name} is {ago:.3f} s older than "
+                                   f"needed; {why}", late=ago < 1.0)
+        early = (times[0] - begin) / SECOND_NS
+        if early > 0 and (max_gap is None or early > max_gap or len(times) == 1):
+            raise MissingTransform(f"the oldest transform of {name} is {early:.3f} s newer than "
+                                   "needed" + (f"; {CLOCKS}" if early > MAX_LAG_S else ""))
+        first, last = bisect_right(times, begin) - 1, bisect_left(times, end)
+        if early > 0:
+            first, last = 0, max(last, 1)
+        if ago > 0:
+            first = min(first, len(times) - 2)
+        chosen = slice(first, last + 1)
+        gap = max((b - a for a, b in pairwise(times[chosen])), default=0) / SECOND_NS
+        if max_gap is not None and gap > max_gap:
+            raise MissingTransform(f"two transforms of {name} are {gap:.3f} s apart at the time "
+                                   "needed")
+        return chosen
+
+
+class TransformTree:
+    """Frames with their poses in their parents.
+
+    Poses are interpolated between stamps, and extrapolated only with max_gap. Transforms are kept
+    for KEPT_NS. A stamp at least JUMP_NS before the last one of its frame means that a bag started
+    again: all moving transforms are forgotten, static ones stay. With keeps_all, for recordings,
+    nothing is forgotten.
+    """
+
+    def __init__(self, keeps_all: bool = False) -> None:
+        self._links: dict[str, _Link] = {}  # by the frame that is the child
+        self._keeps_all = keeps_all
+        self.jumps = 0
+
+    def set(self, parent: str, child: str, stamp_ns: int, translation: Sequence[float] | np.ndarray,
+            quaternion: Sequence[float] | np.ndarray, static: bool = False) -> None:
+        """Set the pose of child in parent at a time, or at all times if it is static.
+
+        A child that gets another parent leaves the first.
+
+        Args:
+            translation, quaternion: (3,) in metres and (4,) [x y z w].
+
+        Raises:
+            InputError: for values that are not a pose, for a frame in itself, and above MAX_FRAMES.
+        """
+        parent, child = parent.lstrip("/"), child.lstrip("/")
+        name = f"'{parent}' -> '{child}'"
+        if not parent or not child or parent == child:
+            raise InputError(f"the transform {name} must be between two frames with names")
+        value = np.concatenate(check_pose(translation, quaternion, f"the transform {name}"))
+        link = self._links.get(child)
+        if link is None and len(self._links) >= MAX_FRAMES:
+            raise InputError(f"more than {MAX_FRAMES} frames in the tree; '{child}' is left out")
+        if link is None or (link.parent, link.static) != (parent, static):
+            link = self._links[child] = _Link(parent, static, self._keeps_all)
+        back = bool(link.times) and stamp_ns <= link.times[-1] - JUMP_NS
+        if back and not static and not self._keeps_all:
+            self.forget()
+            link = self._links[child] = _Link(parent, static, self._keeps_all)
+        link.add(stamp_ns, value)
+
+    def forget(self) -> None:
+        """Forget all moving transforms, because time went back."""
+        self._links = {child: link for child, link in self._links.items() if link.static}
+        self.jumps += 1
+
+    def lookup(self, target: str, source: str, stamp_ns: int,
+               max_gap: float | None = None) -> np.ndarray:
+        """Return the pose (4, 4) of source in target at a time: it transforms source to target.
+
+        Raises:
+            MissingTransform: if they are not connected at that time.
+        """
+        return self.lookup_many(target, source, np.array([stamp_ns]), max_gap)[0]
+
+    def lookup_many(self, target: str, source: str, at: np.ndarray,
+                    max_gap: float | None = None) -> np.ndarray:
+        """Return the poses (M, 4, 4) of source in target at times (M,) int ns, M > 0.
+
+        max_gap: seconds by which moving transforms are extrapolated before their first and after
+            their last pose. Between two poses farther apart than this, a transform is unknown.
+
+        Raises:
+            MissingTransform: if they are not connected at one of these times.
+        """
+        target, source = target.lstrip("/"), source.lstrip("/")
+        up, down = self.find_chain(source), self.find_chain(target)
+        common = next((frame for frame in up if frame in set(down)), None)
+        if common is None:
+            raise MissingTransform(f"TF does not connect '{source}' with '{target}': "
+                                   f"{self._describe(source, up)}, {self._describe(target, down)}")
+        return (invert_pose(self._compose(down, common, at, max_gap))
+                @ self._compose(up, common, at, max_gap))
+
+    def is_fixed(self, frame: str) -> bool:
+        """Return True if a frame does not move in its parent, or has none."""
+        link = self._links.get(frame.lstrip("/"))
+        return link is None or link.static
+
+    def find_chain(self, frame: str) -> list[str]:
+        """Return the frame, its parent, and so on to the root.
+
+        Raises:
+            MissingTransform: for a circle.
+        """
+        chain = [frame.lstrip("/")]
+        while (link := self._links.get(chain[-1])) is not None:
+            chain.append(link.parent)
+            if link.parent in chain[:-1]:
+                raise MissingTransform(f"TF has a loop: {' -> '.join(chain)}; two nodes publish "
+                                       "contradicting transforms")
+        return chain
+
+    def _describe(self, frame: str, chain: list[str]) -> str:
+        if len(chain) > 1:
+            return f"'{frame}' is below '{chain[-1]}'"
+        parents = {link.parent for link in self._links.values()}
+        return f"'{frame}' is " + ("the root of a tree" if frame in parents else "not in TF")
+
+    def _compose(self, chain: list[str], common: str, at: np.ndarray,
+                 max_gap: float | None) -> np.ndarray:
+        pose = np.broadcast_to(np.eye(4), (len(at), 4, 4))
+        for child in chain[:chain.index(common)]:
+            link = self._links[child]
+            pose = link.interpolate(at, f"'{link.parent}' -> '{child}'", max_gap) @ pose
+        return pose
