@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import types
+from numba import njit, types
 from numba.core import cgutils
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
@@ -124,6 +124,30 @@ def _emit_tile(context: Any, builder: ir.IRBuilder, signature: Any, args: Sequen
             builder.store(value, builder.inttoptr(at(place, 4 * LANES * half),
                                                   vector.as_pointer()), align=4)
     return context.get_dummy_value()
+
+
+@njit(cache=True, nogil=True)
+def multiply(rows, weights, bias, floor):
+    """Return (R, C) float32: rows (R, B) times weights, plus bias (C,), and not below floor.
+
+    weights: as packed() returns them, (blocks, 1, channels, BLOCK); B is at least `channels`, and C
+    is blocks x BLOCK.
+    """
+    blocks, _, channels, _ = weights.shape
+    sums = np.empty((len(rows), blocks * BLOCK), np.float32)
+    inputs, starts, outputs = np.empty(ROWS, np.int64), np.empty(ROWS, np.int64), np.empty(
+        ROWS, np.int64)
+    for block in range(blocks):
+        starts[:] = bias.ctypes.data + 4 * BLOCK * block
+        for first in range(0, len(rows), ROWS):
+            for i in range(ROWS):
+                row = min(first + i, len(rows) - 1)  # the last is repeated
+                inputs[i] = rows.ctypes.data + 4 * row * rows.shape[1]
+                outputs[i] = sums.ctypes.data + 4 * (row * sums.shape[1] + BLOCK * block)
+            multiply_tile(inputs.ctypes.data, 1, channels,
+                          weights.ctypes.data + 4 * block * channels * BLOCK, starts.ctypes.data,
+                          outputs.ctypes.data, floor)
+    return sums
 
 
 def packed(weights: np.ndarray) -> np.ndarray:

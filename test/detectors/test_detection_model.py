@@ -284,3 +284,19 @@ def test_a_tiny_network_learns_two_objects():
         torch.testing.assert_close(found[:6], box[:6], atol=0.2, rtol=0)
         assert abs(wrap_angle((found[6] - box[6]).item())) < 0.2
     assert (scores.amax(1) > 0.5).sum() <= 2 * (targets.labels >= 0).sum()
+
+
+@pytest.mark.parametrize("changes", [{}, dict(version="v2"), dict(max_points=3, middle_z=True)])
+def test_pillars_of_one_cloud_equal_those_of_several(changes):
+    config = tiny(**changes)
+    rng = np.random.default_rng(0)
+    low, high = np.array(config.low), np.array(config.high)
+    points = rng.uniform([*(low - 0.5), 0], [*(high + 0.5), 1], (5000, 4)).astype(np.float32)
+    points[:4, 0] = np.nan, np.inf, config.high[0], config.low[0]
+    points[4, 3] = np.nan
+    points = np.column_stack([points, rng.integers(0, 9, 5000)]).astype(np.float32)
+    cloud = torch.from_numpy(points[:, :config.point_columns].copy())
+    alone, several = make_pillars([cloud], config), make_pillars([cloud, cloud[:0]], config)
+    assert 0 < len(alone.points) < 5000
+    for ours, theirs in zip(alone[:3], several[:3]):
+        assert torch.equal(ours, theirs)

@@ -14,7 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidar_perception.detectors.matrix_kernel import BLOCK, LANES, packed, padded, padded_bias
+from lidar_perception.detectors.matrix_kernel import (
+    BLOCK,
+    LANES,
+    multiply,
+    packed,
+    padded,
+    padded_bias,
+)
 from lidar_perception.detectors.parallel import in_parts
 from lidar_perception.detectors.pointnet import kernels
 from lidar_perception.detectors.pointnet.clusters import ClusterInput
@@ -33,7 +40,7 @@ ZERO, NO_FLOOR = np.float32(0), np.float32(-np.inf)
 
 
 class Layer(NamedTuple):
-    """A linear layer of C values: weights and bias as in kernels.multiply, and whether ReLU
+    """A linear layer of C values: weights and bias as in matrix_kernel.multiply, and whether ReLU
     follows."""
 
     weights: np.ndarray
@@ -43,7 +50,7 @@ class Layer(NamedTuple):
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
         """Return (R, C and more), zero beyond C, of rows (R, B)."""
-        return kernels.multiply(rows, self.weights, self.bias, ZERO if self.relu else NO_FLOOR)
+        return multiply(rows, self.weights, self.bias, ZERO if self.relu else NO_FLOOR)
 
 
 class CompiledPointNet:

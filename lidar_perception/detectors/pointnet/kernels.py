@@ -1,4 +1,4 @@
-"""Compiled kernels of the cluster network: layers, groups of points, and maxima.
+"""Compiled kernels of the cluster network: groups of points, and maxima.
 
 Rows of several clusters or groups follow each other: those of number k are first[k] to first[k + 1]
 of first (K + 1,) int64.
@@ -9,31 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lidar_perception.detectors.matrix_kernel import BLOCK, ROWS, UNROLL, multiply_tile
-
-
-@njit(cache=True, nogil=True)
-def multiply(rows, weights, bias, floor):
-    """Return (R, C) float32: rows (R, B) times weights, plus bias (C,), and not below floor.
-
-    weights: as `packed` returns them, (blocks, 1, channels, BLOCK); B is at least `channels`, and C
-    is blocks x BLOCK.
-    """
-    blocks, _, channels, _ = weights.shape
-    sums = np.empty((len(rows), blocks * BLOCK), np.float32)
-    inputs, starts, outputs = np.empty(ROWS, np.int64), np.empty(ROWS, np.int64), np.empty(
-        ROWS, np.int64)
-    for block in range(blocks):
-        starts[:] = bias.ctypes.data + 4 * BLOCK * block
-        for first in range(0, len(rows), ROWS):
-            for i in range(ROWS):
-                row = min(first + i, len(rows) - 1)  # the last is repeated
-                inputs[i] = rows.ctypes.data + 4 * row * rows.shape[1]
-                outputs[i] = sums.ctypes.data + 4 * (row * sums.shape[1] + BLOCK * block)
-            multiply_tile(inputs.ctypes.data, 1, channels,
-                          weights.ctypes.data + 4 * block * channels * BLOCK, starts.ctypes.data,
-                          outputs.ctypes.data, floor)
-    return sums
+from lidar_perception.detectors.matrix_kernel import UNROLL
 
 
 @njit(cache=True, nogil=True)

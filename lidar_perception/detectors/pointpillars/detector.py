@@ -160,6 +160,9 @@ class PointPillarsDetector(NetworkDetector):
                cluster_ids: np.ndarray | None) -> dict[bool, NetworkInput]:
         """The network's inputs, by whether they are turned, where there are any."""
         inputs = {}
+        if len(self.turns) > 1 and self.config.remove_ground and ground is not None:
+            kept = np.flatnonzero(~ground)  # the passes read no other points
+            seen, ground, cluster_ids = seen.take(kept), ground[kept], _taken(cluster_ids, kept)
         for turned in self.turns:
             part, own_ground, own_ids = seen, ground, cluster_ids
             if len(self.turns) > 1:

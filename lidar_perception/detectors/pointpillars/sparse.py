@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidar_perception.detectors.matrix_kernel import LANES, padded, padded_bias
+from lidar_perception.detectors.matrix_kernel import BLOCK, LANES, packed, padded, padded_bias
 from lidar_perception.detectors.parallel import in_parts
 from lidar_perception.detectors.pointpillars import sparse_kernels as kernels
 from lidar_perception.detectors.pointpillars.network import FpnNeck, PointPillars, Prediction
@@ -74,11 +74,11 @@ class SparseNetwork:
         scales = torch.ones(points + offsets)
         scales[:2], scales[4 + offsets:] = config.xy_scale, config.id_scale
         order = [*range(4), *range(4 + offsets, points + offsets), *range(4, 4 + offsets)]
-        scaled = (linear.weight.detach() * scales)[:, order].T.numpy()  # points, then offsets
-        self.pillar_weights = np.zeros((len(scaled), padded(linear.out_features)), np.float32)
-        self.pillar_weights[:, :linear.out_features] = scaled
+        scaled = (linear.weight.detach() * scales)[:, order]  # points, then offsets
+        self.pillar_weights = packed(scaled[:, :, None].numpy())
         bias = None if linear.bias is None else linear.bias.detach().numpy()
-        self.pillar_bias = padded_bias(bias, self.pillar_weights.shape[1])
+        self.pillar_bias = padded_bias(bias, len(self.pillar_weights) * BLOCK)
+        self.pillar_columns = padded(linear.out_features)
         self._empty: dict[Grid, list[Map]] = {}
 
     def __call__(self, pillars: Pillars, maps: Tensor | None) -> Prediction:
@@ -122,7 +122,7 @@ class SparseNetwork:
         occupied = np.zeros(pillars.grid, bool)
         occupied.ravel()[cells] = True
         numbers, index = kernels.number_cells(occupied, _blank(pillars.grid), 1)
-        rows = np.zeros((1 + len(numbers), self.pillar_weights.shape[1]), np.float32)
+        rows = np.zeros((1 + len(numbers), self.pillar_columns), np.float32)
         kernels.pillar_rows(points, offsets, cells, index, self.pillar_weights, self.pillar_bias,
                             rows)
         return Map(index, rows)
@@ -178,7 +178,7 @@ class SparseNetwork:
             for layer in self.layers:
                 small_grids.append(layer.grid(small_grids))
             inputs = [Map(_blank(small), np.zeros((1, width), np.float32))
-                      for width in (len(self.pillar_bias), padded(3))[:count]]
+                      for width in (self.pillar_columns, padded(3))[:count]]
             maps = self._run(inputs, [np.ones(g, bool) for g in small_grids[count:]],
                              [Map(_blank(g), np.zeros((1, len(layer.bias)), np.float32))
                               for g, layer in zip(small_grids[count:], self.layers)])

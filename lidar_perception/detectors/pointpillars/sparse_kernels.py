@@ -9,9 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lidar_perception.detectors.matrix_kernel import BLOCK, ROWS, multiply_tile
+from lidar_perception.detectors.matrix_kernel import BLOCK, ROWS, multiply, multiply_tile
 
-BATCH = 32  # tiles whose addresses are looked up at once
+BATCH = 32    # tiles whose addresses are looked up at once
+POINTS = 192  # points that go through a layer at once
 
 
 @njit(cache=True, nogil=True)
@@ -95,17 +96,22 @@ def number_cells(chosen, template, start):
 
 @njit(cache=True, nogil=True)
 def pillar_rows(points, offsets, cells, index, weights, bias, rows):
-    """Raise rows (R, C) of each pillar to the largest value of its points: relu of weights
-    (P + O, C) times points (N, P) beside offsets (N, O), plus bias (C,); cells (N,) int64."""
+    """Raise the row of each pillar in rows (R, C) to the greatest values of its points: a layer
+    with ReLU, weights and bias as in multiply, of points (N, P) beside offsets (N, O); cells (N,)
+    int64."""
     width, read = index.shape[1] - 2, points.shape[1]
-    values = np.empty_like(bias)
-    for i in range(len(points)):
-        values[:] = bias
-        for j in range(len(weights)):
-            value = points[i, j] if j < read else offsets[i, j - read]
-            for k in range(len(values)):
-                values[k] += value * weights[j, k]
-        row = index[1 + cells[i] // width, 1 + cells[i] % width]
-        for k in range(len(values)):
-            if values[k] > rows[row, k] or values[k] != values[k]:  # NaN stays
-                rows[row, k] = values[k]
+    inputs = np.zeros((POINTS, weights.shape[2]), np.float32)
+    for first in range(0, len(points), POINTS):
+        count = min(POINTS, len(points) - first)
+        for i in range(count):
+            for k in range(read):
+                inputs[i, k] = points[first + i, k]
+            for k in range(offsets.shape[1]):
+                inputs[i, read + k] = offsets[first + i, k]
+        values = multiply(inputs[:count], weights, bias, np.float32(0))
+        for i in range(count):
+            cell = cells[first + i]
+            row = index[1 + cell // width, 1 + cell % width]
+            for k in range(rows.shape[1]):
+                value, known = values[i, k], rows[row, k]
+                rows[row, k] = value if value > known or value != value else known  # NaN stays
