@@ -31,6 +31,10 @@ class InputError(ValueError):
     """Input that cannot be used. The message is one line: what is wrong, and the remedy."""
 
 
+class RunError(InputError):
+    """An error that ends a run over many frames; another InputError skips its frame."""
+
+
 class InputWarning(UserWarning):
     """Input that is used, though something in it is wrong. The message is one line."""
 

@@ -26,7 +26,7 @@ MAX_LINES = 400
 ROOMS = ("classes", "intensity", "types", "param_fields", "geometry", "camera", "groups", "robot",
          "runs", "wire", "ground", "data", "clustering", "candidates", "detectors", "tracking",
          "rendering", "scoring", "simulation", "sensor_setup", "training", "reproduction", "labels",
-         "detecting", "params", "nodes", "cli", "testing")
+         "detecting", "params", "api", "nodes", "cli", "testing")
 # What the files of a room may import besides the rooms below and the standard library.
 NUMBERS = ["numpy", "scipy", "numba"]
 STRANGERS = {
@@ -321,7 +321,9 @@ LIGHT = [
     ("lidar_perception.scoring.comparison.outcomes", "torch matplotlib sklearn click"),
     ("lidar_perception.reproduction.stm_cpa", "torch matplotlib sklearn click jinja2 distributed"),
     ("lidar_perception.camera", "torch matplotlib sklearn"),
+    ("lidar_perception.api", "torch matplotlib"),
 ], [
+    ("lidar_perception", "numpy numba torch matplotlib scipy rosbags rich click"),
     ("lidar_perception.testing", "numpy numba torch matplotlib scipy rosbags click launch_testing"),
     ("lidar_perception.cli.main", "numba torch matplotlib scipy sklearn rosbags"),
     ("lidar_perception.cli.compare", "numba torch matplotlib scipy sklearn"),

@@ -312,8 +312,9 @@ def weights_option(default: str | None = None, multiple: bool = False) -> Callab
     more = " May be repeated." if multiple else f" Default: {default}." if default else ""
     return click.option(
         "--weights", type=click.Path(path_type=Path), metavar="FILE|NAME", multiple=multiple,
-        help="The detector: a checkpoint, a file of `train fused`, or one of fused, pointpillars "
-        f"and pointnet with the weights that come with the package.{more}")
+        help="The detector: a checkpoint, a file of `train fused`, one of fused, pointpillars and "
+        "pointnet with the weights that come with the package, or a class of your own, "
+        f"module:Class.{more}")
 
 
 def read_config(path: Path, known: Any, nodes: Collection[str] | None = None) -> dict[str, Any]:

@@ -10,10 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from lidar_perception.detectors.contract import FUSED, Detector
+from lidar_perception.detectors.custom import (
+    CustomDetectorParams,
+    entry_point_names,
+    find_reference,
+    load_custom_detector,
+)
 from lidar_perception.detectors.params import RANGE_CHOICES
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.compiling import compilation_reported
-from lidar_perception.types import InputError, unknown_name
+from lidar_perception.types import SENSOR_HEIGHT, InputError, unknown_name
 
 if TYPE_CHECKING:
     from lidar_perception.detectors.checkpoint import Header
@@ -71,19 +77,23 @@ def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
     if range not in RANGE_CHOICES:
         raise unknown_name("range", range, RANGE_CHOICES)
     kind, path = kind_and_file(weights)
+    reference = None if kind in LOAD else find_reference(kind)
     asked = {} if device == "auto" else {f"{kind}.device": device}
     if range != "auto" and kind != POINTNET:
         asked[f"{kind}.range"] = range
     if path is not None and f"{kind}.weights" in settings:
         raise InputError(f"{kind}.weights is set, and {path} is given too; give one of them")
     try:
-        if kind in PARAMS:
+        if reference is not None:
+            detector: Any = load_custom_detector(reference, device, range, SENSOR_HEIGHT if
+                                                 sensor_height is None else sensor_height)
+        elif kind in PARAMS:
             own = settings.get("pointnet.weights") if kind == POINTNET else None
             params = with_values(default_params(own or weights), {**asked, **settings})
             detector = _loader(kind)(path or "", getattr(params, kind).device, params)
         else:
             detector = _loader(kind)(path or "", device)
-        if range != "auto" and f"{kind}.range" not in settings:
+        if reference is None and range != "auto" and f"{kind}.range" not in settings:
             detector = detector.with_range(range)
         if sensor_height is not None:
             detector = detector.mounted_at(sensor_height)
@@ -107,6 +117,8 @@ def default_params(weights: str | Path) -> Any:
         InputError: there is no such detector or file.
     """
     kind, path = kind_and_file(weights)
+    if kind not in LOAD:
+        return CustomDetectorParams()
     if kind not in PARAMS:
         return open_detector(weights).params
     params = _attribute(PARAMS[kind])()
@@ -137,16 +149,17 @@ def _as_trained(params: Any, path: Path | None) -> Any:
 
 
 def kind_and_file(weights: str | Path) -> tuple[str, Path | None]:
-    """Return the name of a detector, and the file of its weights, None for those of the package.
+    """Return the name of a detector, and the file of its weights, None for those of the package and
+    for classes.
 
     Raises:
-        InputError: `weights` is neither the name of a detector nor a file of weights.
+        InputError: `weights` is neither the name of a detector, a class, nor a file of weights.
     """
     name, path = str(weights), Path(weights)
-    if name in LOAD:
+    if name in LOAD or (not path.exists() and find_reference(name)):
         return name, None
     if path.name == name and not path.suffix and not path.exists():
-        raise unknown_name("detector or file of weights", name, LOAD)
+        raise unknown_name("detector or file of weights", name, [*LOAD, *entry_point_names()])
     return kind_of(path), path
 
 

@@ -19,9 +19,9 @@ from lidar_perception.data.kitti.results import (
 )
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.runs import journal
-from lidar_perception.scoring.run import RunError, Start
+from lidar_perception.scoring.run import Start
 from lidar_perception.scoring.thinning import thinned
-from lidar_perception.types import Detections, GroundTruth, InputError
+from lidar_perception.types import Detections, GroundTruth, InputError, RunError
 
 Boxes = TypeVar("Boxes", bound=Detections | GroundTruth)
 
@@ -48,6 +48,8 @@ def detected(detector: Detector, frame: Frame, truth: GroundTruth | None,
     begin = perf_counter()
     try:
         found = detector(scan)
+    except RunError:
+        raise
     except InputError as error:
         return Detected(frame.name, truth, Detections.none(), calibration, problem=str(error))
     return Detected(frame.name, truth, found.detections, calibration,

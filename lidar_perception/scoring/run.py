@@ -27,7 +27,7 @@ from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.runs.journal import Journal
 from lidar_perception.runs.processes import in_processes
 from lidar_perception.runs.terminal import track
-from lidar_perception.types import InputError
+from lidar_perception.types import InputError, RunError
 
 Start = Callable[[Recording], Callable[[Frame], Any]]
 
@@ -49,10 +49,6 @@ class Report(Protocol):
 
 class Skipped(str):
     """Why a frame could not be measured."""
-
-
-class RunError(InputError):
-    """Ends the whole run instead of skipping a frame: what is to be judged cannot be read."""
 
 
 def fill(report: Report, recording: Recording, start: Start, *, limit: int | None = None,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import overload
 
-from lidar_perception.data.frame import Frame
+from lidar_perception.data.frame import BOXES, CAMERA, POSES, Frame, Recording
 from lidar_perception.simulation.camera import FORWARD_CAMERA, labels_around, labels_in_view
 from lidar_perception.simulation.drive import longest_drive, scan_at
 from lidar_perception.simulation.scene import ANY, Scenes
@@ -14,19 +16,55 @@ from lidar_perception.simulation.sensor import HDL64E, Sensor
 GAP_NS = 10 * 10**9  # between the drives through two scenes, as between KITTI's recordings
 
 
+class SimulatedFrames(Sequence[Frame]):
+    """Frames of simulated drives; each is computed when it is read.
+
+    With a forward camera they have, as in KITTI, labels of the objects whose centre it sees. Where
+    not all scenes have a camera, they have labels all around.
+    """
+
+    def __init__(self, seed: int, frames: int, sensor: Sensor = HDL64E,
+                 frames_per_drive: int | None = None, scenes: Scenes = ANY) -> None:
+        """Each of the scenes seed, seed + 1, ... has frames_per_drive frames, by default as many
+        as fit into a drive."""
+        self._seed, self._frames, self._sensor, self._scenes = seed, frames, sensor, scenes
+        self._per_drive = frames_per_drive or longest_drive(sensor)
+        self._has_camera = scenes.camera
+
+    def __len__(self) -> int:
+        return self._frames
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Frame]: ...
+
+    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        number = range(len(self))[index]
+        camera, labels = ((FORWARD_CAMERA, labels_in_view) if self._has_camera else
+                          (None, labels_around))
+        scene, moment = divmod(number, self._per_drive)
+        drive_ns = GAP_NS + round(self._per_drive * 10**9 / self._sensor.rate)
+        scan = scan_at(self._seed + scene, moment, self._sensor, self._scenes)
+        frame = replace(scan.frame, stamp_ns=scan.frame.stamp_ns + scene * drive_ns)
+        return Frame.of(f"{scene:04}/{moment:06}", frame, labels(scan.truth), camera,
+                        pose=scan.pose.copy, sequence=f"{scene:04}", index=moment,
+                        sensor_height=self._sensor.height)
+
+
 def simulated_scans(seed: int, frames: int, sensor: Sensor = HDL64E,
                     streets_of: int | None = None, scenes: Scenes = ANY) -> Iterator[Frame]:
-    """Frames with the forward camera and, as in KITTI, labels of the objects whose centre it sees;
-    where not all scenes have a camera, without one and with labels all around: streets_of
-    (default: as many as fit) of each of the scenes seed, seed + 1, ..."""
-    camera, labels = ((FORWARD_CAMERA, labels_in_view) if scenes.camera else
-                      (None, labels_around))
-    each = streets_of or longest_drive(sensor)
-    drive_ns = GAP_NS + round(each * 10**9 / sensor.rate)
-    for number in range(frames):
-        scene, moment = divmod(number, each)
-        scan = scan_at(seed + scene, moment, sensor, scenes)
-        frame = replace(scan.frame, stamp_ns=scan.frame.stamp_ns + scene * drive_ns)
-        yield Frame.of(f"{scene:04}/{moment:06}", frame, labels(scan.truth),
-                       camera, pose=scan.pose.copy, sequence=f"{scene:04}", index=moment,
-                       sensor_height=sensor.height)
+    """Yield the frames of SimulatedFrames, with streets_of frames of each scene."""
+    yield from SimulatedFrames(seed, frames, sensor, streets_of, scenes)
+
+
+def simulated_recording(seed: int, frames: int, sensor: Sensor = HDL64E,
+                        scenes: Scenes = ANY) -> Recording:
+    """Return simulated drives as a recording that no file holds."""
+    has = {BOXES, POSES} | ({CAMERA} if scenes.camera else set())
+    return Recording(Path("simulation"), f"simulated {scenes.scene}",
+                     SimulatedFrames(seed, frames, sensor, None, scenes), frozenset(has),
+                     timed=True)

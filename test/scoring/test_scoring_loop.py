@@ -14,8 +14,8 @@ from samples import object_folder, walker_label, write
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.scoring.detections import by_files
-from lidar_perception.scoring.run import RunError, Skipped, fill, in_order, results
-from lidar_perception.types import InputError
+from lidar_perception.scoring.run import Skipped, fill, in_order, results
+from lidar_perception.types import InputError, RunError
 
 COUNT = 5
 

@@ -1,0 +1,250 @@
+"""Functions of the public interface: keyword arguments in place of parameter dataclasses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lidar_perception.candidates.configurations import BEST
+from lidar_perception.candidates.pipeline import find_candidates as run_pipeline
+from lidar_perception.candidates.seed_sources import make_automatic_source, make_click_source
+from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.clustering.params import CLUSTERING_METHODS, ClusteringParams
+from lidar_perception.data.frame import BOXES, Recording
+from lidar_perception.data.mount_check import apply_measured_height, load_first_clouds
+from lidar_perception.data.open import open_recording
+from lidar_perception.detectors.contract import FUSED, Detector
+from lidar_perception.detectors.custom import as_detector
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.params import MIN_SCORE
+from lidar_perception.ground import segment
+from lidar_perception.ground.params import GROUND_METHODS, GroundParams
+from lidar_perception.param_fields import with_values
+from lidar_perception.scoring.detections import by_detector
+from lidar_perception.scoring.kitti.report import DetectionReport
+from lidar_perception.scoring.run import Skipped, results
+from lidar_perception.simulation.scene import Scenes
+from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.simulation.to_bag import simulated_recording
+from lidar_perception.types import (
+    SENSOR_HEIGHT,
+    Detections,
+    InputError,
+    LidarFrame,
+    as_frame,
+    unknown_name,
+)
+
+P = TypeVar("P")  # a dataclass of parameters
+
+
+def load_detector(name_or_file: str | Path = FUSED, *, device: str = "auto", range: str = "auto",
+                  sensor_height: float | None = None, min_score: float | None = None,
+                  settings: Mapping[str, Any] | None = None) -> Detector:
+    """Load a detector: detector(cloud).detections are the objects in a cloud.
+
+    Args:
+        name_or_file: a detector with the weights of the package (fused, pointpillars or pointnet);
+            a file of weights (.safetensors, .onnx or the .json of `train fused`); or a class of
+            your own, as "module:Class" or by the name of its entry point.
+        device: auto, cpu, cuda or cuda:N.
+        range: ahead, around, or auto, the range that the weights were trained for.
+        sensor_height: height of the sensor above the ground in metres. Default: 1.73, as in KITTI.
+        min_score: threshold of every class, 0..1. Default: those of the detector.
+        settings: other parameters by their dotted names, such as {"fused.scores.car": 0.7}. They
+            take precedence over the arguments above.
+
+    Raises:
+        InputError: the detector cannot be loaded, or an argument is unknown or out of range.
+    """
+    return open_detector(name_or_file, device, sensor_height=sensor_height, min_score=min_score,
+                         range=range, settings=settings or {})
+
+
+def segment_ground(xyz: LidarFrame | ArrayLike, method: str = "threshold", *,
+                   sensor_height: float = SENSOR_HEIGHT, intensity: ArrayLike | None = None,
+                   **params: Any) -> np.ndarray:
+    """Segment the ground of a cloud.
+
+    Args:
+        xyz: (N, 3) [x y z] or (N, 4) [x y z intensity] of a level sensor, metres, z up; or a
+            PointCloud.
+        method: threshold (one plane), patchwork (Patchwork++) or cloth (cloth simulation).
+        sensor_height: height of the sensor above the ground, in metres.
+        intensity: (N,) if xyz is (N, 3); only patchwork uses it, to remove reflections.
+        params: parameters of the method, such as max_range=60.0 of patchwork. They are those of
+            the node ground_segmentation without their prefix ground.METHOD.
+
+    Returns:
+        (N,) bool, True = ground. Points that are not finite and points at the origin are not
+        ground.
+
+    Raises:
+        InputError: xyz or intensity has another shape, or the method or a parameter is unknown or
+            out of range.
+    """
+    if method not in GROUND_METHODS:
+        raise unknown_name("ground method", method, GROUND_METHODS)
+    defaults = GroundParams()
+    pose = _set_params(defaults.sensor_pose, {"height": sensor_height})
+    own = _set_params(getattr(defaults, method), params)
+    return segment.segment_ground(_make_cloud(xyz, intensity), replace(
+        defaults, method=method, sensor_pose=pose, **{method: own}))
+
+
+def cluster(xyz: LidarFrame | ArrayLike, method: str = "dbscan", *,
+            ground: ArrayLike | None = None, density: float = 0.0, **params: Any) -> np.ndarray:
+    """Cluster the points of a cloud.
+
+    Args:
+        xyz: (N, 3) [x y z] or (N, 4) [x y z intensity], metres; or a PointCloud.
+        method: dbscan (eps grows with the range) or euclidean (adaptive).
+        ground: (N,) bool; True = not clustered. Default: all points are clustered.
+        density: points per square degree of view for which the parameters are meant; they adapt
+            to sparser clouds. 0: they are used unchanged.
+        params: parameters of the method, such as min_samples=5 of dbscan. They are those of the
+            node clustering without their prefix clustering.METHOD.
+
+    Returns:
+        (N,) int32 ids: 1..K for the clusters, 0 for ground and points without a cluster.
+
+    Raises:
+        InputError: xyz or ground has another shape, or the method or a parameter is unknown or
+            out of range.
+    """
+    if method not in CLUSTERING_METHODS:
+        raise unknown_name("clustering method", method, CLUSTERING_METHODS)
+    defaults = ClusteringParams()
+    own = _set_params(getattr(defaults, method), params)
+    chosen = _set_params(replace(defaults, method=method, **{method: own}), {"density": density})
+    cloud = as_frame(xyz)
+    mask = np.zeros(len(cloud), bool) if ground is None else np.asarray(ground)
+    return cluster_obstacles(cloud, mask, chosen)
+
+
+def find_candidates(xyz: LidarFrame | ArrayLike, *, click: ArrayLike | None = None,
+                    sensor_height: float = SENSOR_HEIGHT, ground: np.ndarray | None = None,
+                    cluster_ids: np.ndarray | None = None,
+                    settings: Mapping[str, Any] | None = None) -> Detections:
+    """Find pedestrian candidates without a trained network (STM-CPA, configuration `best`).
+
+    Args:
+        xyz: (N, 3) [x y z] or (N, 4) [x y z intensity], metres, z up; or a PointCloud.
+        click: (3,) a point on a pedestrian, whose silhouette becomes the template. Default: the
+            cluster that is most likely a pedestrian, or else the template of the package.
+        sensor_height: height of the sensor above the ground, in metres.
+        ground: (N,) bool, such as from segment_ground(). Default: segmented here.
+        cluster_ids: (N,) int, such as from cluster(). Default: clustered here.
+        settings: other parameters by their dotted names, such as {"stm.threshold": 0.5}; they are
+            those of the node perception.
+
+    Returns:
+        Pedestrians with the confidence as score; K = 0 without any.
+
+    Raises:
+        InputError: an array has another shape, there is no cluster at click, or a parameter is
+            unknown or out of range.
+    """
+    params = _set_params(BEST, {"view.enabled": False,
+                                "ground.sensor_pose.height": sensor_height, **(settings or {})})
+    seed = (make_automatic_source(load_seed(params.seed.file), params) if click is None else
+            make_click_source(np.asarray(click, float), params.seed))
+    _, candidates = run_pipeline(xyz, seed, None, params, ground=ground, cluster_ids=cluster_ids)
+    return candidates.final
+
+
+def evaluate(detector: str | Path | Detector | Callable[[LidarFrame], Detections],
+             recording: str | Path | Recording, *, limit: int | None = None,
+             min_score: float | None = MIN_SCORE, intervals: int = 0) -> dict[str, Any]:
+    """Score a detector on the labelled frames of a recording, as `evaluate detection` does.
+
+    Args:
+        detector: a loaded detector, anything that returns Detections for a PointCloud, or what
+            load_detector() takes. The last is opened for the height of the recording's sensor.
+        recording: an open recording, or its path.
+        limit: number of frames. Default: all.
+        min_score: threshold of every class. Average precision needs boxes of low score; None
+            keeps the detector's thresholds.
+        intervals: number of bootstrap resamples for 90 % intervals; 0: none.
+
+    Returns:
+        The content of the JSON file of `evaluate detection`. result["ap"]["Car"]["3d"]["moderate"]
+        ["r40"] is an average precision in percent; "skipped" lists frames that were not scored.
+
+    Raises:
+        InputError: the recording or the detector cannot be used, or no frame has labels.
+    """
+    if not isinstance(recording, Recording):
+        recording = open_recording(recording)
+    recording.require(BOXES, "evaluate")
+    if isinstance(detector, (str, Path)):
+        recording = apply_measured_height(recording, load_first_clouds(recording))
+        loaded: Detector = open_detector(detector, min_score=min_score,
+                                         sensor_height=recording.frames[0].sensor_height)
+    else:
+        loaded = as_detector(detector)
+        loaded = loaded if min_score is None else loaded.with_min_score(min_score)
+    report = DetectionReport(follow=recording.drives)
+    numbers = range(min(len(recording), limit or len(recording)))
+    for _, result in results(recording, by_detector(lambda: loaded), numbers):
+        if isinstance(result, Skipped):
+            report.skipped.append(str(result))
+        elif result is not None:
+            report.update(result)
+    if not report.frames:
+        reason = f" ({report.skipped[0]})" if report.skipped else ""
+        raise InputError(f"{recording.path}: no frame with labels{reason}")
+    content = report.compute()
+    return {**content, "intervals": report.intervals(intervals)} if intervals else content
+
+
+def simulate(frames: int = 40, seed: int = 1, sensor: str = "hdl64e", scene: str = "street", *,
+             kind: str | None = None, people: float = 1.0,
+             sensor_height: float | None = None) -> Recording:
+    """Simulate labelled scans; each is computed when it is read.
+
+    Args:
+        frames: number of scans. A new scene starts after the 20 s of a drive.
+        seed: of the first scene; the same seed gives the same scans.
+        sensor: a preset in any spelling, such as vlp-16, or a .yaml file of `setup`.
+        scene: street, campus or another scene of `simulate`, or several, such as street,campus.
+        kind: kind of the scene. Default: all in turn.
+        people: pedestrians and cyclists, as a multiple of the usual number.
+        sensor_height: metres above the ground. Default: that of the sensor's preset or file.
+
+    Returns:
+        A recording: iterate over its frames, or pass it to evaluate(). frame.load() is the cloud,
+        frame.truth() the labels.
+
+    Raises:
+        InputError: an argument is unknown or out of range.
+    """
+    if frames < 1 or seed < 0:
+        name, value, low = ("frames", frames, 1) if frames < 1 else ("seed", seed, 0)
+        raise InputError(f"{name} = {value} must be {low} or more")
+    return simulated_recording(seed, frames, sensor_named(sensor, sensor_height or 0.0),
+                               scenes=Scenes(kind, people, scene))
+
+
+def _make_cloud(xyz: LidarFrame | ArrayLike, intensity: ArrayLike | None) -> LidarFrame:
+    if intensity is not None and isinstance(xyz, LidarFrame):
+        raise InputError("a PointCloud has its own intensity; give either a PointCloud or arrays")
+    return as_frame(xyz, intensity)
+
+
+def _set_params(params: P, values: Mapping[str, Any]) -> P:
+    """Return the parameters with these values.
+
+    Raises:
+        InputError: a name is unknown, or a value is out of range.
+    """
+    try:
+        return with_values(params, values)
+    except ValueError as error:
+        raise InputError(str(error)) from None

@@ -1,0 +1,242 @@
+"""Detectors of your own: any class whose instances return Detections for a cloud."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import os
+import re
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from time import perf_counter
+from typing import Any, cast
+
+import numpy as np
+
+from lidar_perception.classes import DETECTED
+from lidar_perception.detectors.contract import Cloud, Detector, Found, accept
+from lidar_perception.detectors.params import ScoreParams
+from lidar_perception.ground.params import SensorPoseParams
+from lidar_perception.param_fields import Params
+from lidar_perception.robot.params import CropParams
+from lidar_perception.types import (
+    CLASSES,
+    SENSOR_HEIGHT,
+    Detections,
+    InputError,
+    LidarFrame,
+    RunError,
+    did_you_mean,
+    unknown_name,
+)
+
+ENTRY_POINTS = "lidar_perception.detectors"  # group of entry points: NAME = "module:Class"
+REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
+ARGUMENTS = "sensor_height", "device", "range"  # of a class, each passed on if the class takes it
+
+
+@dataclass(frozen=True)
+class MountParams(Params):
+    """Mounting of the sensor."""
+
+    sensor_pose: SensorPoseParams = SensorPoseParams()
+
+
+@dataclass(frozen=True)
+class CustomParams(Params):
+    """What counts as a detection."""
+
+    scores: ScoreParams = ScoreParams.all_alike(0.0)
+
+
+@dataclass(frozen=True)
+class CustomDetectorParams:
+    """All groups of a detector of your own. Settings of the class itself are not among them."""
+
+    crop: CropParams = CropParams()
+    ground: MountParams = MountParams()
+    custom: CustomParams = CustomParams()
+
+
+@dataclass(frozen=True)
+class CustomDetector:
+    """Adapter from a function of a cloud to contract.Detector.
+
+    Attributes:
+        name: for messages.
+        build: returns the function for a sensor height in metres.
+        classes: names of the classes that it can detect.
+        params: crop, mounting and, in the group `group`, the thresholds.
+        device: where it runs, for the status of a node.
+    """
+
+    name: str
+    build: Callable[[float], Callable[[LidarFrame], Any]]
+    classes: tuple[str, ...] = tuple(DETECTED)
+    params: Any = field(default_factory=CustomDetectorParams)
+    group: str = "custom"
+    device: str = "auto"
+
+    @property
+    def scores(self) -> ScoreParams:
+        """Thresholds by class."""
+        return getattr(self.params, self.group).scores
+
+    @property
+    def min_scores(self) -> Mapping[str, float]:
+        """Minimum score of a detection, by class."""
+        return {name: self.scores.of_class(name) for name in self.classes}
+
+    def with_params(self, params: Any) -> CustomDetector:
+        """Return this detector with other parameters."""
+        return replace(self, params=params)
+
+    def with_min_score(self, min_score: float) -> CustomDetector:
+        """Return this detector with one threshold for all classes."""
+        own = replace(getattr(self.params, self.group), scores=ScoreParams.all_alike(min_score))
+        return self.with_params(replace(self.params, **{self.group: own}))
+
+    def mounted_at(self, height: float) -> CustomDetector:
+        """Return this detector for a sensor mounted `height` metres above the ground."""
+        pose = replace(self.params.ground.sensor_pose, height=height)
+        return self.with_params(replace(
+            self.params, ground=replace(self.params.ground, sensor_pose=pose)))
+
+    def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
+                 cluster_ids: np.ndarray | None = None) -> Found:
+        """See contract.Detector; ground and cluster_ids are checked and not used.
+
+        Raises:
+            RunError: the function did not return Detections.
+        """
+        frame, _, _, problem = accept(cloud, ground, cluster_ids)
+        pose = self.params.ground.sensor_pose
+        if self.params.crop.enabled:
+            from lidar_perception.ground.segment import crop_with_sensor_pose  # loads Numba
+            _, frame = crop_with_sensor_pose(frame, self.params.crop, pose)
+        begin = perf_counter()
+        found = self.build(pose.height)(frame)
+        milliseconds = (perf_counter() - begin) * 1e3
+        if not isinstance(found, Detections):
+            raise RunError(f"{self.name} returned {type(found).__name__}; a detector returns "
+                           "Detections, such as lidar_perception.Detections.of(boxes, class_ids, "
+                           "scores)")
+        return Found(found[self.scores.passed(found)], {"detect": milliseconds}, problem)
+
+
+def as_detector(detector: Detector | Callable[[LidarFrame], Detections]) -> Detector:
+    """Return a detector as it is, and any other function of a cloud in an adapter.
+
+    Raises:
+        InputError: it cannot be called, or is a class instead of an instance.
+    """
+    if isinstance(detector, type) or not callable(detector):
+        raise InputError(f"{detector!r} is not a detector; give an instance with "
+                         "__call__(cloud) -> Detections")
+    if hasattr(detector, "with_min_score") and hasattr(detector, "min_scores"):
+        return cast(Detector, detector)
+    name = getattr(detector, "__name__", type(detector).__name__)
+    return CustomDetector(name, lambda height: detector, _find_classes(name, detector))
+
+
+def find_reference(name: str) -> str | None:
+    """Return "module:Class" for a reference or the name of an entry point; None for other names."""
+    if REFERENCE.fullmatch(name):
+        return None if Path(name).exists() else name
+    return next((each.value for each in entry_points(group=ENTRY_POINTS) if each.name == name),
+                None)
+
+
+def entry_point_names() -> list[str]:
+    """List the detectors of other packages."""
+    return sorted({each.name for each in entry_points(group=ENTRY_POINTS)})
+
+
+def load_custom_detector(reference: str, device: str = "auto", range: str = "auto",
+                         sensor_height: float = SENSOR_HEIGHT) -> CustomDetector:
+    """Load the detector of a class, whose instances return Detections for a PointCloud.
+
+    Args:
+        reference: "module:Class". The module is on Python's path or in the current folder.
+        device, range, sensor_height: passed on if the class takes an argument of that name;
+            sensor_height is in metres.
+
+    Raises:
+        InputError: the module or the class is missing or fails, or the class does not take the
+            range.
+    """
+    make = _find_class(reference)
+    taken = _find_arguments(make)
+    if range != "auto" and "range" not in taken:
+        raise InputError(f"{reference} takes no range; leave it out, or add an argument `range` to "
+                         "the class")
+    values = {name: value for name, value in (("device", device), ("range", range))
+              if name in taken}
+
+    @lru_cache(maxsize=2)
+    def build(height: float | None) -> Callable[[LidarFrame], Any]:
+        own = values if height is None else {**values, "sensor_height": height}
+        try:
+            detector = make(**own)
+        except Exception as error:
+            raise InputError(f"{reference} cannot be created: {_describe(error)}") from error
+        if not callable(detector):
+            raise InputError(f"{reference} has no method __call__(cloud) -> Detections")
+        return detector
+
+    takes_height = "sensor_height" in taken
+    adapter = CustomDetector(reference, lambda height: build(height if takes_height else None),
+                             device=device).mounted_at(sensor_height)
+    return replace(adapter, classes=_find_classes(reference, adapter.build(sensor_height)))
+
+
+def _find_class(reference: str) -> Callable[..., Any]:
+    module_name, _, class_name = reference.partition(":")
+    if (here := os.getcwd()) not in sys.path:
+        sys.path.append(here)  # a console script does not have it, unlike `python -m`
+    try:
+        found: Any = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
+            raise InputError(f"{module_name} cannot be imported: {_describe(error)}") from error
+        raise InputError(f"there is no module {module_name!r}; run the command in its folder, or "
+                         "add the folder to PYTHONPATH") from None
+    except Exception as error:
+        raise InputError(f"{module_name} cannot be imported: {_describe(error)}") from error
+    for name in class_name.split("."):
+        if not hasattr(found, name):
+            known = [key for key, value in vars(found).items() if isinstance(value, type)]
+            raise InputError(f"{module_name} has no class {class_name!r}"
+                             f"{did_you_mean(class_name, known)}")
+        found = getattr(found, name)
+    if not callable(found):
+        raise InputError(f"{reference} is not a class but {type(found).__name__}")
+    return found
+
+
+def _find_arguments(make: Callable[..., Any]) -> set[str]:
+    """Return those of ARGUMENTS that a class takes by keyword."""
+    try:
+        parameters = inspect.signature(make).parameters
+    except ValueError:  # a class that is written in C
+        return set()
+    return {name for name in ARGUMENTS if name in parameters
+            and parameters[name].kind is not inspect.Parameter.POSITIONAL_ONLY}
+
+
+def _find_classes(name: str, detector: Any) -> tuple[str, ...]:
+    """Return the attribute `classes` of a detector, or the names of all classes."""
+    classes = tuple(getattr(detector, "classes", DETECTED))
+    for each in classes:
+        if each not in CLASSES:
+            raise unknown_name(f"class of {name}", each, CLASSES)
+    return classes
+
+
+def _describe(error: Exception) -> str:
+    """Return type and message of an error in one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
