@@ -31,7 +31,7 @@ __version__ = "0.1.0"
 __all__ = ["Detections", "PointCloud", "Tracker", "Tracks", "cluster", "evaluate",
            "find_candidates", "load_detector", "open_recording", "segment_ground", "simulate"]
 
-_OTHER_MODULES = {  # module and name of what is not in lidar_perception.api
+_OTHER_MODULES = {  # (module, name) of everything outside lidar_perception.api
     "Detections": ("types", "Detections"),
     "PointCloud": ("types", "LidarFrame"),
     "Tracker": ("tracking.tracker", "Tracker"),

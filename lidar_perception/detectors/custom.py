@@ -48,7 +48,7 @@ class MountParams(Params):
 
 @dataclass(frozen=True)
 class CustomParams(Params):
-    """What counts as a detection."""
+    """Thresholds of the detections."""
 
     scores: ScoreParams = ScoreParams.all_alike(0.0)
 
