@@ -62,7 +62,7 @@ class CustomDetectorParams:
     custom: CustomParams = CustomParams()
 
 
-@dataclass(frozen=True)
+@dataclass
 class CustomDetector:
     """Adapter from a function of a cloud to contract.Detector.
 

@@ -1,0 +1,121 @@
+"""Detectors of one's own: classes by reference or entry point, in the adapter."""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint
+
+import numpy as np
+import pytest
+from samples import scene
+
+from lidar_perception.detectors import custom
+from lidar_perception.detectors.open import default_params, kind_and_file, open_detector
+from lidar_perception.types import Detections, InputError, RunError
+
+MODULE = """
+import lidar_perception as lp
+
+class Fixed:
+    classes = ("Pedestrian", "Car")
+    def __init__(self, sensor_height=1.73, device="auto"):
+        self.height, self.device = sensor_height, device
+    def __call__(self, cloud):
+        boxes = [[5, 0, 0, 1, 1, self.height, 0], [9, 0, 0, 1, 1, len(cloud), 0]]
+        return lp.Detections.of(boxes, [3, 0], [0.9, 0.3])
+
+class Returns:
+    def __call__(self, cloud):
+        return cloud.xyz
+
+class Fails:
+    def __init__(self):
+        raise OSError("no\\nmodel")
+
+class NoCall:
+    pass
+
+class OddClasses(Fixed):
+    classes = ("Pedestrain",)
+
+value = 3
+"""
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """Name of a module in the current folder, imported anew by each test."""
+    name = f"own_{tmp_path.name}"
+    (tmp_path / f"{name}.py").write_text(MODULE)
+    (tmp_path / f"{name}_broken.py").write_text("import nothing_there")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*custom.sys.path])
+    return name
+
+
+def test_class_gets_sensor_height_and_device(module):
+    detector = open_detector(f"{module}:Fixed", "cpu", sensor_height=0.5)
+    assert detector.classes == ("Pedestrian", "Car")
+    found = detector(scene(0))
+    assert found.detections.boxes[0, 5] == 0.5 and set(found.ms) == {"detect"}
+    higher = detector.mounted_at(2.0)
+    assert higher(scene(0)).detections.boxes[0, 5] == 2.0
+    assert detector(scene(0)).detections.boxes[0, 5] == 0.5
+    assert detector.build(0.5).device == "cpu" and detector.build(0.5) is detector.build(0.5)
+
+
+def test_scores_below_threshold_are_dropped(module):
+    detector = open_detector(f"{module}:Fixed")
+    assert len(detector(scene(0)).detections) == 2 and detector.min_scores["Car"] == 0.0
+    assert len(detector.with_min_score(0.5)(scene(0)).detections) == 1
+    chosen = open_detector(f"{module}:Fixed", settings={"custom.scores.pedestrian": 0.95})
+    assert chosen(scene(0)).detections.class_ids.tolist() == [0]
+
+
+def test_cloud_holds_usable_cropped_points(module):
+    cloud = scene(0)
+    cloud[:5] = np.nan
+    whole = open_detector(f"{module}:Fixed")(cloud).detections.boxes[1, 5]
+    assert whole == len(cloud) - 5
+    ahead = open_detector(f"{module}:Fixed", settings={"crop.enabled": True, "crop.max_range": 9.0})
+    assert 0 < ahead(cloud).detections.boxes[1, 5] < whole
+
+
+@pytest.mark.parametrize("reference, words", [
+    ("{}:Fixd", "has no class 'Fixd'; did you mean 'Fixed'"),
+    ("{}:value", "is not a class but int"),
+    ("{}:Fails", "cannot be created: OSError: no model"),
+    ("{}:NoCall", "has no method __call__"),
+    ("{}:OddClasses", "did you mean 'Pedestrian'"),
+    ("{}_broken:Fixed", "cannot be imported: ModuleNotFoundError: No module named 'nothing_there'"),
+    ("{}_absent:Fixed", "there is no module"),
+])
+def test_unusable_class_is_refused_in_one_line(module, reference, words):
+    with pytest.raises(InputError, match=words) as error:
+        open_detector(reference.format(module))
+    assert "\n" not in str(error.value)
+
+
+def test_range_is_refused_where_class_takes_none(module):
+    with pytest.raises(InputError, match="takes no range"):
+        open_detector(f"{module}:Fixed", range="around")
+
+
+def test_wrong_return_type_ends_the_run(module):
+    with pytest.raises(RunError, match="returned ndarray; a detector returns Detections"):
+        open_detector(f"{module}:Returns")(scene(0))
+
+
+def test_entry_point_names_a_class(module, monkeypatch):
+    points = [EntryPoint("mine", f"{module}:Fixed", custom.ENTRY_POINTS)]
+    monkeypatch.setattr(custom, "entry_points", lambda group: points)
+    assert kind_and_file("mine") == ("mine", None)
+    assert len(open_detector("mine")(scene(0)).detections) == 2
+    assert default_params("mine") == custom.CustomDetectorParams()
+    with pytest.raises(InputError, match="Valid names: .*, mine"):
+        open_detector("mime")
+
+
+def test_function_becomes_a_detector():
+    detector = custom.as_detector(lambda cloud: Detections.of([1, 0, 0, 1, 1, 1, 0], 3, 0.5))
+    assert len(detector(scene(0)).detections) == 1
+    assert custom.as_detector(detector) is detector
