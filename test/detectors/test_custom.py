@@ -76,7 +76,7 @@ def test_cloud_holds_usable_cropped_points(module):
     cloud[:5] = np.nan
     whole = open_detector(f"{module}:Fixed")(cloud).detections.boxes[1, 5]
     assert whole == len(cloud) - 5
-    ahead = open_detector(f"{module}:Fixed", settings={"crop.enabled": True, "crop.max_range": 9.0})
+    ahead = open_detector(f"{module}:Fixed", settings={"crop.max_range": 9.0})
     assert 0 < ahead(cloud).detections.boxes[1, 5] < whole
 
 
@@ -111,7 +111,7 @@ def test_entry_point_names_a_class(module, monkeypatch):
     assert kind_and_file("mine") == ("mine", None)
     assert len(open_detector("mine")(scene(0)).detections) == 2
     assert default_params("mine") == custom.CustomDetectorParams()
-    with pytest.raises(InputError, match="Valid names: .*, mine"):
+    with pytest.raises(InputError, match=r"Valid names: .*, mine"):
         open_detector("mime")
 
 
