@@ -96,3 +96,11 @@ def test_each_node_has_one_executable_beside_the_package(metadata):
     assert all(os.access(ROOT / file, os.X_OK) for file in files)
     assert [line.split()[0] for line in given["entry_points"]["console_scripts"]] == [
         "lidar-perception"]
+
+
+def test_wheel_ships_the_weights_of_the_default_detector_and_v4(metadata):
+    package = ROOT / "lidar_perception"
+    shipped = {path.name for pattern in metadata(URL)["package_data"]["lidar_perception"]
+               for path in package.glob(pattern) if path.suffix == ".safetensors"}
+    assert shipped == {"judge.safetensors", "pointnet.safetensors",
+                       "pointpillars_v4_compact.safetensors", "pointpillars_v4_full.safetensors"}
