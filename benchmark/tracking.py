@@ -50,7 +50,7 @@ def measure_recording(recording: Recording) -> dict:
     drives: dict[str, list[Seen]] = {}
     source = ego_of(recording)
     for frame in track(recording, "detecting", len(recording)):
-        truth, frame = frame.truth(), frame.loaded_once()
+        truth, frame = frame.truth(), frame.with_cached_scan()
         if truth is not None and all("track_id" in extra for extra in truth.extras):
             if frame.sequence not in drives:
                 pose_of = recorded_poses(source)

@@ -14,10 +14,10 @@ import numpy as np
 from lidar_perception.camera import Camera
 from lidar_perception.classes import CLASSES, DETECTED, PEDESTRIAN, TABLE
 from lidar_perception.data.bag import Bag
-from lidar_perception.data.bag_frames import cloud_topic
+from lidar_perception.data.bag_frames import choose_cloud_topic
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.kitti.results import read_results, result_calibration, result_files
+from lidar_perception.data.kitti.results import choose_calibration, find_result_folder, read_results
 from lidar_perception.data.to_bag import MARKERS
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.geometry import bev_iou
@@ -152,14 +152,14 @@ def by_files(folder: Path) -> Source:
     one has no detections. InputError where a file is no result."""
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder} with result files")
-    files = result_files(folder)
+    files = find_result_folder(folder)
 
     @lru_cache(maxsize=KEPT)
     def read(i: int, frame: Frame) -> Detections:
         path = files / f"{frame.name}.txt"
         if not path.exists():
             return Detections.none()
-        rows = read_results(path, result_calibration(frame)[0].lidar_to_camera)
+        rows = read_results(path, choose_calibration(frame)[0].lidar_to_camera)
         return Detections.of(rows.boxes, rows.class_ids, [e["score"] for e in rows.extras])
     return Source(read)
 
@@ -169,14 +169,14 @@ def points_topic(path: Path) -> str:
     bag_frames.cloud_topic. InputError where that is not clear."""
     with Bag(path) as bag:
         known = [topic for topic in CLUSTERED if bag.counts.get(topic)]
-        return known[0] if known else cloud_topic(bag)
+        return known[0] if known else choose_cloud_topic(bag)
 
 
 def recorded(poses: BagPoses, stamps: list[int]) -> Results:
     """What a bag holds beside its clouds, whose poses and stamps are given: detections of every
     node, tracks. A message belongs to the cloud of its stamp. A topic whose boxes nothing connects
     with the clouds' frame is left out, and that is said."""
-    bag = poses.opened.bag()
+    bag = poses.handle.bag()
     wanted = {topic for topic, kind in bag.topics.items() if kind == MARKERS and topic != TRUTH
               and topic.endswith((FOUND, TRACKS))}
     found = by_stamp(bag, sorted(wanted))
@@ -186,7 +186,7 @@ def recorded(poses: BagPoses, stamps: list[int]) -> Results:
     trackers = [topic for topic in found if topic.endswith(TRACKS)]
     for topic, marked in found.items():
         try:
-            frames = {numbers[stamp]: poses.brought(each, topic)
+            frames = {numbers[stamp]: poses.to_cloud_frame(each, topic)
                       for stamp, each in marked.items() if stamp in numbers}
         except InputError as error:
             errors.print(f"left out: {error}", style="yellow")

@@ -1,4 +1,4 @@
-"""A small drive for the tests of bags, and what a bag holds."""
+"""A small drive for the tests of bags."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from lidar_perception.types import LidarFrame
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, TF_STATIC
 
 OTHER_CALIBRATION = Calibration(CALIBRATION.intrinsics * [[2], [2], [1]],
-                                     CALIBRATION.lidar_to_camera, 640, 480)
+                                CALIBRATION.lidar_to_camera, 640, 480)
 LATCHED = {CAMERA_INFO, EXTRINSICS, TF_STATIC}
 
 
 def scans(count: int = 3) -> list[Frame]:
-    """Truth in all but the second; the calibration changes after the second."""
+    """Return frames, all but the second with labels; the calibration changes after the second."""
     return [Frame.of(str(i), cloud_frame(scene(i), STAMP + i * 10**8),
                      None if i == 1 else walker_truth(),
                      CALIBRATION if i < 2 else OTHER_CALIBRATION) for i in range(count)]
 
 
 def cloud_frame(cloud: np.ndarray, stamp_ns: int) -> LidarFrame:
-    """cloud (N, 4) [x y z intensity]."""
+    """Return a frame of cloud (N, 4) [x y z intensity]."""
     return LidarFrame(np.ascontiguousarray(cloud[:, :3]), cloud[:, 3].copy(), stamp_ns, "velodyne")
 
 
 def message_bytes(path) -> list[tuple[str, int, bytes]]:
     with Bag(path) as bag:
-        return list(bag.raw())
+        return list(bag.raw_messages())
 
 
 def same_cloud(cloud: np.ndarray, xyz: np.ndarray) -> bool:
@@ -44,7 +44,7 @@ def same_cloud(cloud: np.ndarray, xyz: np.ndarray) -> bool:
 
 
 def as_ros1(source: Path, path: Path, compress: str | None = None) -> Path:
-    """Write a copy of a bag for ROS 1 to path and return path; compress: lz4, bz2 or None."""
+    """Convert a bag to ROS 1 and return its path; `compress` is lz4, bz2 or None."""
     with redirect_stdout(io.StringIO()):
         convert([source], path, "", 0, compress, "", None, get_typestore(Stores.ROS1_NOETIC),
                 (), (), (), ())

@@ -1,4 +1,4 @@
-"""KITTI folders of every layout with made-up scans, for the tests of KITTI."""
+"""KITTI folders in every layout with synthetic scans."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def tracking_folder(root):
         for i in frames:
             write(root / f"training/velodyne/{sequence}/{i:06}.bin", scene(i).tobytes())
         write(root / f"training/calib/{sequence}.txt",
-              calibration_text("R_rect", "Tr_velo_cam"))  # without colons, as it comes
+              calibration_text("R_rect", "Tr_velo_cam"))  # without colons, as in KITTI's files
     write(root / "training/label_02/0000.txt", TRACKING_LABELS)
     return root
 
@@ -76,16 +76,16 @@ LAYOUTS = {"object": object_folder, "tracking": tracking_folder, "raw": raw_fold
 each_layout = pytest.mark.parametrize("layout", LAYOUTS)
 
 
-def text_of(truth: GroundTruth) -> list[str]:
+def format_truth(truth: GroundTruth) -> list[str]:
     return [format_label(label) for label in to_labels(truth, LIDAR_TO_CAMERA)]
 
 
-def over_the_wire(truth: GroundTruth) -> GroundTruth:
+def through_markers(truth: GroundTruth) -> GroundTruth:
     raw = encode(make_truth_markers(truth, header(bag_message), bag_message))
     return to_truth(from_marker_array(decode(raw, "visualization_msgs/msg/MarkerArray")))
 
 
 def same(a: GroundTruth, b: GroundTruth) -> bool:
-    turned = np.abs((a.boxes[:, 6] - b.boxes[:, 6] + np.pi) % (2 * np.pi) - np.pi)
-    return (np.array_equal(a.boxes[:, :6], b.boxes[:, :6]) and bool((turned < 1e-12).all())
+    yaw_difference = np.abs((a.boxes[:, 6] - b.boxes[:, 6] + np.pi) % (2 * np.pi) - np.pi)
+    return (np.array_equal(a.boxes[:, :6], b.boxes[:, :6]) and bool((yaw_difference < 1e-12).all())
             and a.labels == b.labels and a.extras == b.extras and a.notes == b.notes)

@@ -1,4 +1,4 @@
-"""A recording of every kind that is known, as folders and files of a few small scans."""
+"""A small recording in every supported layout."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from kitti_samples import raw_folder, tracking_folder
 from samples import CALIBRATION, object_folder, scene, write
 
 from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, POSES
-from lidar_perception.data.semantickitti import calibration_text, pose_line, write_scan
+from lidar_perception.data.semantickitti import format_calibration, format_pose, write_scan
 from lidar_perception.data.to_bag import write_bag
 
 
 def drive(i):
-    """Pose of scan i of a sequence."""
-    turn, pose = 0.1 * i, np.eye(4)
-    pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    """Return the pose of scan i of a sequence."""
+    yaw, pose = 0.1 * i, np.eye(4)
+    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     pose[:3, 3] = [2.0 * i, 0.3 * i, -0.1 * i]
     return pose
 
 
 def semantic_folder(root):
-    """Two sequences; every point has labels of its own."""
+    """Write two sequences; each point has other labels."""
     for sequence, count in (("00", 2), ("08", 1)):
         folder = root / "sequences" / sequence
         for i in range(count):
             cloud = scene(i)
             write_scan(folder, i, cloud, np.arange(len(cloud)) % 260, np.arange(len(cloud)) % 7)
-        write(folder / "poses.txt", "".join(pose_line(drive(i), CALIBRATION)
+        write(folder / "poses.txt", "".join(format_pose(drive(i), CALIBRATION)
                                             for i in range(count)))
-        write(folder / "calib.txt", calibration_text(CALIBRATION))
+        write(folder / "calib.txt", format_calibration(CALIBRATION))
     return root
 
 
 def nuscenes_root(root):
-    return nuscenes_folder.save(root, nuscenes_folder.made_tables(frames=3, objects=6))
+    return nuscenes_folder.save(root, nuscenes_folder.make_tables(frames=3, objects=6))
 
 
 def reduced_folder(root):
@@ -51,20 +51,20 @@ def bag_folder(root):
 
 
 def odometry_folder(root):
-    """Two sequences with times, poses and calibration, as downloaded from KITTI."""
+    """Write two sequences with times, poses and calibration, as downloaded from KITTI."""
     for sequence, count in (("00", 2), ("11", 1)):
         folder = root / "dataset/sequences" / sequence
         for i in range(count):
             write(folder / f"velodyne/{i:06}.bin", scene(i).tobytes())
-        write(folder / "calib.txt", calibration_text(CALIBRATION))
+        write(folder / "calib.txt", format_calibration(CALIBRATION))
         write(folder / "times.txt", "".join(f"{0.1036 * i:e}\n" for i in range(count)))
         write(root / f"dataset/poses/{sequence}.txt",
-              "".join(pose_line(drive(i), CALIBRATION) for i in range(count)))
+              "".join(format_pose(drive(i), CALIBRATION) for i in range(count)))
     return root
 
 
 def kitti360_folder(root):
-    """Scans 0, 1 and 3 of a drive."""
+    """Write scans 0, 1 and 3 of a drive."""
     name = "2013_05_28_drive_0000_sync"
     scans = root / f"data_3d_raw/{name}/velodyne_points"
     for i in (0, 1, 3):
@@ -84,12 +84,12 @@ def openpcdet_folder(root):
 
 
 def cloud_folder(root):
-    for i in (1, 2, 10):  # in this order, as people count
+    for i in (1, 2, 10):  # in numeric order
         write(root / f"scan{i}.bin", scene(i).astype(np.float32).tobytes())
     return root
 
 
-MADE = {  # name: (make, inner folders or files that say the same, what is said of it)
+MADE = {  # name: (writer, inner paths that are the same recording, description, content)
     "object": (object_folder, ("", "training"), "KITTI object data, 2 frames", {BOXES, CAMERA}),
     "tracking": (tracking_folder, ("", "training"), "KITTI tracking data, 5 frames",
                  {BOXES, CAMERA}),
@@ -108,6 +108,6 @@ MADE = {  # name: (make, inner folders or files that say the same, what is said 
     "openpcdet": (openpcdet_folder, ("",), "OpenPCDet custom data, 3 frames", {BOXES}),
     "bag": (bag_folder, ("", "bag.mcap"), "rosbag2 bag, clouds on /points, 3 frames",
             {BOXES, CAMERA}),
-    "files": (cloud_folder, ("",), ".bin clouds, no times in their names, 3 frames", set()),
+    "files": (cloud_folder, ("",), ".bin clouds, no times in file names, 3 frames", set()),
 }
 each_recording = pytest.mark.parametrize("kind", MADE)

@@ -1,4 +1,4 @@
-"""Bags as other robots record them: odometry of the base at times of its own, and TF."""
+"""Bags of robots: odometry of the base at its own rate, and TF."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,14 +15,13 @@ from lidar_perception.wire.transforms import ODOMETRY_MESSAGE, TF_MESSAGE
 from msg_utils.stamps import SECOND, header_message
 
 START, CLOUDS = 1_700_000_000 * SECOND, 5
-ON_BASE = make_tilted_pose(0.02, -0.05,
-                           1.1)  # the sensor in base_link: leaning, and turned to the left
+ON_BASE = make_tilted_pose(0.02, -0.05, 1.1)  # pose of the sensor in base_link
 ON_BASE[:3, :3] = ON_BASE[:3, :3] @ Rotation.from_euler("z", 90, degrees=True).as_matrix()
 ON_BASE[0, 3] = 0.4
 
 
 def base_at(stamp):
-    """A robot on a curve, in odom."""
+    """Return the pose of the base in odom, on a curve."""
     t = (stamp - START) / SECOND
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("z", 0.3 * t).as_matrix()
@@ -31,7 +30,7 @@ def base_at(stamp):
 
 
 def stamps():
-    """Of the clouds, between those of the odometry."""
+    """Return the stamps of the clouds, which are between those of the odometry."""
     return [START + round((0.1 * i + 0.003) * SECOND) for i in range(CLOUDS)]
 
 
@@ -50,7 +49,7 @@ def tf(*transforms):
 
 
 def moving(topic, child="base_link", seconds=CLOUDS / 10):
-    """Odometry every 20 ms."""
+    """Yield odometry every 20 ms."""
     for i in range(-2, round(50 * seconds) + 1):
         stamp = START + i * SECOND // 50
         yield topic, ODOMETRY_MESSAGE, stamp, make_odometry(
@@ -58,11 +57,11 @@ def moving(topic, child="base_link", seconds=CLOUDS / 10):
 
 
 def moving_tf(seconds=CLOUDS / 10):
-    """map -> odom -> base_link every 20 ms; the map jumps."""
+    """Yield map -> odom -> base_link every 20 ms; the map frame jumps."""
     for i in range(-2, round(50 * seconds) + 1):
         stamp = START + i * SECOND // 50
-        yield TF, TF_MESSAGE, stamp, tf(transform("map", "odom", stamp,
-                                                  make_tilted_pose(0, 0, i % 2)),
+        jump = make_tilted_pose(0, 0, i % 2)
+        yield TF, TF_MESSAGE, stamp, tf(transform("map", "odom", stamp, jump),
                                         transform("odom", "base_link", stamp, base_at(stamp)))
 
 
@@ -72,12 +71,12 @@ def mount(parent="base_link", pose=ON_BASE):
 
 
 def point(stamp):
-    """A cloud of one point."""
+    """Return a cloud of one point."""
     return cloud_message(np.ones((3, 4)), stamp, "lidar")
 
 
 def recorded(path, *parts, cloud=point):
-    """The frames of a bag with clouds of the frame lidar and these messages."""
+    """Write a bag of clouds in the frame lidar and the given messages; return the recording."""
     messages = [message for part in parts for message in part]
     messages += [(POINTS, "sensor_msgs/msg/PointCloud2", stamp, cloud(stamp))
                  for stamp in stamps()]
@@ -90,7 +89,7 @@ def recorded(path, *parts, cloud=point):
 
 
 def check(recording, on_base=ON_BASE):
-    """Its sensor is where the base and the mount say."""
+    """Assert that the poses are those of the base and the mount."""
     assert POSES in recording.has
     for frame, stamp in zip(recording, stamps(), strict=True):
         np.testing.assert_allclose(frame.pose(), base_at(stamp) @ on_base, atol=1e-4)

@@ -75,7 +75,7 @@ def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, range: str,
         found, missing = contenders(weights, device, height, range, values)
     open_ = (lambda: found) if walk.here else partial(opened_in_a_process, weights, device, height,
                                                       range, values)
-    report = ComparisonReport(found, intervals, recording.drives)
+    report = ComparisonReport(found, intervals, recording.is_sequential)
     walk.fill(report, recording, partial(by_contenders, open_), title="comparing")
     if not report.first.frames:
         raise no_labels(recording, report.skipped)

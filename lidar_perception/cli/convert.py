@@ -103,32 +103,32 @@ def _seen(recording: Any, file: Path | None, deskew: bool) -> Callable[[Any], An
     if file is None and not deskew:
         return lambda frame: frame
     from lidar_perception.data import bag_frames, cloud_folder
-    if not any(layout.recognises(recording.path) for layout in (bag_frames, cloud_folder)):
+    if not any(layout.is_layout(recording.path) for layout in (bag_frames, cloud_folder)):
         raise InputError(f"{recording.path} ({recording.layout}) has level clouds; --robot and "
                          "--deskew are for bags and files of clouds")
-    from lidar_perception.data.levelled import Robot, levelled
-    robot = Robot()
+    from lidar_perception.data.levelled import SensorMount, level_frame
+    robot = SensorMount()
     if file is not None:
         robot, asked = _robot(file)
         deskew = deskew or asked
     if not deskew:
-        return partial(levelled, robot=robot)
-    from lidar_perception.data.bag import KeptOpen
+        return partial(level_frame, mount=robot)
+    from lidar_perception.data.bag import BagHandle
     from lidar_perception.data.bag_poses import BagPoses
-    if not bag_frames.recognises(recording.path):
+    if not bag_frames.is_layout(recording.path):
         raise InputError(f"{recording.path} is no bag, so that nothing says how its sensor moved, "
                          "which --deskew needs")
     first = recording.frames[len(recording) // 2]
-    poses = BagPoses(KeptOpen(recording.path), first.load().frame_id).at
-    levelled(first, robot, poses).load()  # what lacks in all of them is said at once
-    return partial(levelled, robot=robot, poses=poses)
+    poses = BagPoses(BagHandle(recording.path), first.load().frame_id).lookup
+    level_frame(first, robot, poses).load()  # what lacks in all of them is said at once
+    return partial(level_frame, mount=robot, poses=poses)
 
 
 def _robot(file: Path) -> tuple[Any, bool]:
     """The data.levelled.Robot of a parameter file, and whether it asks for deskewing."""
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
-    from lidar_perception.data.levelled import Robot
+    from lidar_perception.data.levelled import SensorMount
     from lidar_perception.param_fields import with_values
     from lidar_perception.params import CloudNodeParams
     try:
@@ -144,8 +144,9 @@ def _robot(file: Path) -> tuple[Any, bool]:
                          "read it; leave base_frame out and give the box in the sensor's frame, "
                          "as setup writes it")
     pose = params.ground.sensor_pose
-    return Robot(pose.height, pose.roll, pose.pitch, math.radians(node.input.ahead), params.crop,
-                 params.input.intensity_max), node.input.deskew != "off"
+    return SensorMount(pose.height, pose.roll, pose.pitch, math.radians(node.input.ahead),
+                       params.crop,
+                       params.input.intensity_max), node.input.deskew != "off"
 
 
 def _bag(source: Path, recording: Any, seen: Callable[[Any], Any], out: Path, images: bool,
@@ -163,9 +164,9 @@ def _bag(source: Path, recording: Any, seen: Callable[[Any], Any], out: Path, im
 
 def _on_topic(source: Path, recording: Any, topic: str) -> Any:
     """DriveLabels of the boxes on a topic of a bag."""
-    from lidar_perception.data.open import with_topic
+    from lidar_perception.data.open import split_topic
     from lidar_perception.labels.formats import bag
-    return bag.read(with_topic(source)[0], recording.frames[:], topic)
+    return bag.read(split_topic(source)[0], recording.frames[:], topic)
 
 
 def _dataset(source: Path, recording: Any, seen: Callable[[Any], Any], format: str, out: Path,

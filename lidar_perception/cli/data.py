@@ -193,7 +193,7 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
         if (full := recording.frames[0].intensity_max()) > 1:
             errors.print(f"its intensity is 0 .. {full:g}, read as 0 .. 1", style="dim")
         for problem in filter(None, (
-                None if recording.mounted else find_mount_problem(recording, clouds),
+                None if recording.has_sensor_height else find_mount_problem(recording, clouds),
                 diagnose_recorded_intensity(recording.path, clouds))):
             errors.print(problem, style="yellow")
     return measured
@@ -201,7 +201,7 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
 
 def lost_labels(recording: Any) -> list[str]:
     """Return a line that counts the labels whose scan is missing; none where all are there."""
-    lost = [reason for _, reason in recording.lost]
+    lost = [reason for _, reason in recording.missing_scans]
     return [f"labels without a scan: {len(lost)}, such as {lost[0]}"] if lost else []
 
 

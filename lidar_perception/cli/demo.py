@@ -176,7 +176,7 @@ def _params_of(chosen: DetectorChoice, played: Recording) -> Any:
 def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
     """The bag to replay: the one that was given, or one made of it, or of a simulated drive."""
     if recording is not None and isinstance(recording.frames, BagFrames) and (
-            recording.frames.points == POINTS and recording.frames.poses.plain):
+            recording.frames.points == POINTS and recording.frames.poses.needs_no_tf):
         return recording.path
     if recording is not None:
         found = track(recording, f"converting {recording.path}", len(recording))

@@ -116,7 +116,7 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
     if not track and (ego != "auto" or tracking != TrackingParams()):
         raise click.UsageError("--ego and --set tracking.* are for --track")
     recording = opened(data, split=split, sensor_height=mount_height or None)
-    if track and not recording.drives:
+    if track and not recording.is_sequential:
         raise InputError(f"{data} ({recording.layout}) has frames that do not follow each other, "
                          "so nothing can be tracked; leave out --track")
     chosen = list(dict.fromkeys(name for names in formats for name in names))

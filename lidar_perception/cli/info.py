@@ -13,7 +13,7 @@ from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import data_argument, lost_labels
 from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import Bag
-from lidar_perception.data.open import expected, layout_of, open_recording
+from lidar_perception.data.open import describe_formats, find_layout, open_recording
 from lidar_perception.runs.terminal import console
 from lidar_perception.types import InputError
 
@@ -31,9 +31,10 @@ def info(data: Path, as_json: bool) -> None:
       lidar-perception info /data/kitti/tracking
       lidar-perception info drive.bag --json
     """
-    layout = layout_of(data)
+    layout = find_layout(data)
     if layout is None and data.is_dir():
-        raise InputError(f"{data} has no metadata.yaml and is no other recording: {expected()}")
+        raise InputError(f"{data} has no metadata.yaml and is no other recording: "
+                         f"{describe_formats()}")
     if layout in (None, bag_frames):
         content, show = _bag(data), _print_bag
     else:
@@ -79,7 +80,7 @@ def _recording(path: Path) -> dict[str, Any]:
         "path": str(path), "summary": str(recording), "layout": recording.layout,
         "frames": len(recording), "has": sorted(recording.has),
         "drives": sorted({frame.sequence for frame in recording if frame.sequence}),
-        "start_ns": min(frame.stamp_ns for frame in recording) if recording.timed else None,
+        "start_ns": min(frame.stamp_ns for frame in recording) if recording.has_times else None,
         "first_cloud": {
             "name": first.name, "points": len(scan), "full_intensity": first.intensity_max(),
             "greatest_intensity": None if scan.intensity is None else

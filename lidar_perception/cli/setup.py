@@ -51,7 +51,7 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
     there = [name for name in FILES if (out / name).exists()]
     if there and not force:
         raise InputError(f"{out / there[0]} exists already; give another folder or --force")
-    from lidar_perception.data.raw_clouds import open_clouds, spread
+    from lidar_perception.data.raw_clouds import choose_clouds, open_clouds
     from lidar_perception.sensor_setup.doubts import doubts
     from lidar_perception.sensor_setup.files import params_yaml, sensor_yaml
     from lidar_perception.sensor_setup.findings import findings
@@ -67,7 +67,7 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
     count = f"{clouds.count} cloud{'s' * (clouds.count != 1)}"
     errors.print(f"{data}: {clouds.layout}, {count}", style="dim")
     numbers, found, skipped = [], [], []
-    chosen = spread(clouds.count, scans)
+    chosen = choose_clouds(clouds.count, scans)
     with progress() as bar:
         task = bar.add_task("reading", total=len(chosen) + 2)
         for i in chosen:

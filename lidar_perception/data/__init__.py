@@ -1,1 +1,1 @@
-"""Labelled frames: KITTI, nuScenes and SemanticKITTI folders, and rosbag2 bags."""
+"""Recordings: bags, data sets and point cloud files, read and written without ROS."""

@@ -1,4 +1,4 @@
-"""Bags: MCAP, SQLite3 and those of ROS 1 in, MCAP out, with or without ROS."""
+"""Reading of bags (MCAP, SQLite3, ROS 1) and writing of MCAP bags, without ROS."""
 
 from __future__ import annotations
 
@@ -17,46 +17,46 @@ import yaml
 from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Qos
 
-from lidar_perception.data.bag_metadata import NAME, compare, read_metadata
+from lidar_perception.data.bag_metadata import NAME, add_differences, read_metadata
 from lidar_perception.data.mcap_file import NO_INDEX
-from lidar_perception.data.open_storage import damaged, find_files, open_file
-from lidar_perception.data.qos import LATCHED_QOS, SENSOR_QOS, full_profile, read_profiles
+from lidar_perception.data.open_storage import describe_damage, find_files, open_file
+from lidar_perception.data.qos import LATCHED_QOS, SENSOR_QOS, complete_profile, parse_profiles
 from lidar_perception.data.record_file import RecordFile
 from lidar_perception.data.ros1_bag import Ros1File
-from lidar_perception.data.storage import END, START, StorageFile, Topic, in_time_order
+from lidar_perception.data.storage import END, START, StorageFile, Topic, merge_streams
 from lidar_perception.runs.files import check_free, refuse_others, require_name
 from lidar_perception.runs.resuming import locked
 from lidar_perception.types import InputError, InputWarning
 from lidar_perception.wire.codec import decode, encode, load_typestore
 from lidar_perception.wire.compression import decompress_message
 
-__all__ = ["LATCHED_QOS", "SENSOR_QOS", "Bag", "BagWriter", "KeptOpen"]
+__all__ = ["LATCHED_QOS", "SENSOR_QOS", "Bag", "BagHandle", "BagWriter"]
 
-# A KITTI cloud is 1.9 MB. Chunks that hold several compress better and are read in fewer steps.
+# A KITTI cloud has 1.9 MB. Chunks of several clouds compress better and are read in fewer steps.
 CHUNK_BYTES = 8 * 2**20
-SHOWN = 3  # differences between metadata.yaml and the files, in a warning
+MAX_SHOWN = 3  # differences between metadata.yaml and the files that a warning lists
 
-_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # faster, where it was built
+_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # faster, but optional
 
 
-class _Plain(_Dumper):
-    """YAML without anchors, as other readers of metadata.yaml expect it."""
+class _PlainDumper(_Dumper):
+    """YAML dumper that writes no anchors, which other readers of metadata.yaml do not expect."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
 
-def _yaml(content: Any) -> str:
-    return yaml.dump(content, Dumper=_Plain, sort_keys=False)
+def _to_yaml(content: Any) -> str:
+    return yaml.dump(content, Dumper=_PlainDumper, sort_keys=False)
 
 
 class BagWriter:
-    """Writes a rosbag2 folder with one MCAP file: zstd chunks, checksums, metadata.yaml.
+    """Writer of a rosbag2 folder with one MCAP file, zstd chunks, checksums and metadata.yaml.
 
-    A context manager, of one process at a time. The folder appears under its name once it is
-    complete; after an exception what was written so far is closed properly and left as
-    NAME.incomplete. InputError where the disk is full: NAME.incomplete then holds the messages that
-    found room.
+    A context manager. Only one process can write a bag at a time. The folder gets its name when it
+    is complete. After an exception, the messages written so far are kept in a valid bag
+    NAME.incomplete. InputError if the disk is full; NAME.incomplete then holds the messages that
+    fit.
     """
 
     def __init__(self, path: str | Path, *, force: bool = False):
@@ -66,23 +66,24 @@ class BagWriter:
         self.channels: dict[str, int] = {}
         self.topics: list[dict] = []
         self.times: list[int] = []
-        self._may_write()
+        self._check_target()
 
-    def _may_write(self) -> None:
+    def _check_target(self) -> None:
         check_free(self.path, self.force)
         if self.path.exists():
             if not (self.path / "metadata.yaml").is_file():
-                raise InputError(f"{self.path} is no bag, so it is not replaced; give another name")
+                raise InputError(f"{self.path} is not a bag and is not overwritten; give another "
+                                 "name")
             refuse_others(self.path, ("metadata.yaml", "*.mcap*", "*.db3*"))
 
     def __enter__(self) -> BagWriter:
         with ExitStack() as stack, self._named():
             stack.enter_context(locked(self.partial))
-            self._may_write()  # another process may just have written it
+            self._check_target()  # another process may just have written it
             for old in self.partial.iterdir():
                 shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
             self.file = stack.enter_context(RecordFile(self.partial / f"{self.path.name}.mcap"))
-            stream = cast(IO[bytes], self.file)  # mcap only writes, tells and flushes
+            stream = cast(IO[bytes], self.file)  # mcap only calls write, tell and flush
             self.mcap = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
             self.mcap.start(profile="ros2", library="lidar_perception")
             self.open = stack.pop_all()
@@ -93,14 +94,14 @@ class BagWriter:
         try:
             yield
         except OSError as error:
-            raise InputError(f"cannot write the bag {self.path}: {error.strerror or error}; what "
-                             f"could be written is in {self.partial}") from None
+            raise InputError(f"cannot write the bag {self.path}: {error.strerror or error}; the "
+                             f"messages written so far are in {self.partial}") from None
 
     def add_topic(self, topic: str, type_name: str, qos: dict = SENSOR_QOS) -> None:
         definition, _ = load_typestore().generate_msgdef(type_name, ros_version=2)
         schema = self.mcap.register_schema(type_name, "ros2msg", definition.encode())
-        profile = [full_profile(qos)]
-        metadata = {"offered_qos_profiles": _yaml(profile),
+        profile = [complete_profile(qos)]
+        metadata = {"offered_qos_profiles": _to_yaml(profile),
                     "topic_type_hash": load_typestore().hash_rihs01(type_name)}
         channel = self.mcap.register_channel(topic, "cdr", schema, metadata)
         self.channels[topic] = channel
@@ -110,7 +111,7 @@ class BagWriter:
             "type_description_hash": load_typestore().hash_rihs01(type_name)}, "message_count": 0})
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Append a message: an object of bag_message, or CDR bytes as they are."""
+        """Append a message: an object of bag_message, or CDR bytes."""
         channel = self.channels[topic]
         raw = message if isinstance(message, bytes) else encode(message)
         with self._named():
@@ -123,12 +124,12 @@ class BagWriter:
             try:
                 self._finish()
             except OSError:
-                # As mcap has it, a file may end without an index; so may a bag without metadata.
+                # An MCAP file may lack an index, and a bag may lack metadata.
                 self.file.close_with(NO_INDEX)
                 (self.partial / "metadata.yaml").unlink(missing_ok=True)
                 if kind is None:
                     raise
-                return  # the error that there is says why
+                return  # the exception that ended the context is raised
             if kind is None:
                 if self.path.exists():
                     shutil.rmtree(self.path)
@@ -145,11 +146,11 @@ class BagWriter:
                 "topics_with_message_count": self.topics, "compression_format": "",
                 "compression_mode": "", "files": [{"path": name, **span}], "custom_data": None,
                 "ros_distro": "jazzy"}
-        self.mcap.add_metadata("rosbag2", {"serialized_metadata": _yaml(info)})
+        self.mcap.add_metadata("rosbag2", {"serialized_metadata": _to_yaml(info)})
         self.mcap.finish()
         self.file.sync()
         with open(self.partial / "metadata.yaml", "w") as stream:
-            stream.write(_yaml({"rosbag2_bagfile_information": info}))
+            stream.write(_to_yaml({"rosbag2_bagfile_information": info}))
             stream.flush()
             os.fsync(stream.fileno())
 
@@ -158,20 +159,20 @@ class Bag:
     """A bag open for reading; a context manager.
 
     A bag is a rosbag2 folder, a folder of ROS 1 bags, or one storage file. Topics, counts and times
-    are those of its files; where metadata.yaml says otherwise, an InputWarning says so.
+    are those of its files; an InputWarning lists contradictions in metadata.yaml.
 
     Args:
-        warn: whether to warn; False where another Bag of this path has done so.
+        warn: False to suppress these warnings, for a bag that was opened before.
 
     Attributes:
-        topics: name -> type, of the topics that can be read.
-        counts: name -> number of messages of each of them.
-        unreadable: name -> Topic, of topics whose messages nothing here reads.
+        topics: type of each readable topic, by its name.
+        counts: number of messages of each readable topic, by its name.
+        unreadable: topics in an unsupported encoding, by their names.
         start_ns, end_ns: time of the first message, and after the last one; 0 without messages.
 
     Raises:
-        InputError: it is damaged, or no bag. Checksums and counts are compared; damage in a file
-            without checksums may pass.
+        InputError: the bag is damaged, or the path is not a bag. Checksums and counts are verified;
+            damage in a file without checksums may go unnoticed.
     """
 
     def __init__(self, path: str | Path, *, warn: bool = True):
@@ -188,24 +189,28 @@ class Bag:
             times = [file.times for _, file in self.files if file.times is not None]
             self.start_ns = min((first for first, _ in times), default=0)
             self.end_ns = max((last + 1 for _, last in times), default=0)
-            compare(metadata, recorded, self.start_ns, self.end_ns - self.start_ns - 1)
+            add_differences(metadata, recorded, self.start_ns, self.end_ns - self.start_ns - 1)
             self._offered = metadata.qos
             for topic, (kind, _) in metadata.topics.items():
                 if topic not in self.unreadable:
                     self.topics.setdefault(topic, kind)
                     self.counts.setdefault(topic, 0)
             if metadata.problems:
-                shown, more = metadata.problems[:SHOWN], len(metadata.problems) - SHOWN
-                problems.append(f"{self.path / NAME} is wrong: {'; '.join(shown)}"
-                                f"{f', and {more} more' if more > 0 else ''}. The bag is read by "
-                                "what its files hold")
+                shown, more = metadata.problems[:MAX_SHOWN], len(metadata.problems) - MAX_SHOWN
+                problems.append(f"{self.path / NAME} does not match the bag: {'; '.join(shown)}"
+                                f"{f', and {more} more' if more > 0 else ''}. The contents of the "
+                                "storage files are used")
             for problem in problems if warn else ():
                 warnings.warn(problem, InputWarning, stacklevel=2)
             self.close = stack.pop_all().close
 
     def _take_topics(self) -> tuple[Counter[str], list[str]]:
-        """Set topics, counts and unreadable. Return the number of messages by topic, readable or
-        not, and a line for each topic with several types, of which the most frequent one counts."""
+        """Set topics, counts and unreadable.
+
+        Returns:
+            The number of messages of every topic, readable or not, and a warning for each topic
+            with several types, of which the most frequent one is read.
+        """
         recorded, problems = Counter[str](), []
         kinds: dict[str, Counter[str]] = {}
         for _, file in self.files:
@@ -219,8 +224,8 @@ class Bag:
             self.unreadable.pop(name, None)
             (self.topics[name], self.counts[name]), *others = found.most_common()
             if left_out := [f"{count} of {kind}" for kind, count in others if count]:
-                problems.append(f"{self.path}: {name} has messages of several types; those of "
-                                f"{self.topics[name]} are read, not {', '.join(left_out)}")
+                problems.append(f"{self.path}: {name} has messages of several types; only "
+                                f"{self.topics[name]} is read, not {', '.join(left_out)}")
         return recorded, problems
 
     def __enter__(self) -> Bag:
@@ -234,39 +239,49 @@ class Bag:
 
     @property
     def layout(self) -> str:
-        """Kind of the bag: "rosbag2 bag" or "ROS 1 bag"."""
+        """Kind of bag: "rosbag2 bag" or "ROS 1 bag"."""
         return f"{'ROS 1' if isinstance(self.files[0][1], Ros1File) else 'rosbag2'} bag"
 
     @property
     def content(self) -> str:
-        """Text that lists the topics with their types."""
+        """Topics with their types, as text."""
         others = {name: f"{topic.type} as {topic.encoding}"
                   for name, topic in self.unreadable.items()}
         return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(
             {**others, **self.topics}.items())) or "nothing"
 
     def qos(self, topic: str) -> list[Qos]:
-        """Return the profiles that the topic was recorded with, as rosbags has them; maybe none.
-        Those of metadata.yaml come first, where people edit them for `ros2 bag play`."""
-        return read_profiles(self._offered.get(topic)) or list(dict.fromkeys(
+        """Return the QoS profiles that a topic was recorded with; an empty list if unknown.
+
+        Profiles in metadata.yaml take precedence, as people edit them for `ros2 bag play`.
+        """
+        return parse_profiles(self._offered.get(topic)) or list(dict.fromkeys(
             profile for _, file in self.files for each in file.topics if each.name == topic
-            for profile in read_profiles(each.qos)))
+            for profile in parse_profiles(each.qos)))
 
     def require(self, topic: str) -> None:
-        """InputError that lists what there is, if the bag has no such topic."""
+        """Raise InputError that lists the available topics if the bag lacks a topic."""
         if other := self.unreadable.get(topic):
-            raise InputError(f"{self.path} has {other.type} as {other.encoding} on {topic}, which "
-                             "is not read; record it with ROS 2")
+            raise InputError(f"{self.path} has {other.type} as {other.encoding} on {topic}; this "
+                             "encoding is not supported: record it with ROS 2")
         if topic not in self.topics:
             raise InputError(f"{self.path} has no topic {topic}; it has {self.content}")
 
-    def raw(self, topics: Iterable[str] | None = None, start_ns: int | None = None,
+    def raw_messages(self, topics: Iterable[str] | None = None, start_ns: int | None = None,
             stop_ns: int | None = None) -> Iterator[tuple[str, int, bytes]]:
-        """Yield (topic, time, CDR bytes) in order of time; all topics by default. InputError where
-        the bag is damaged, at the end of a file that has other numbers of messages than it says."""
+        """Yield (topic, time in ns, CDR bytes) in order of time.
+
+        Args:
+            topics: default all.
+            start_ns, stop_ns: only messages with start_ns <= time < stop_ns.
+
+        Raises:
+            InputError: the bag is damaged. A number of messages other than declared is detected at
+                the end of a file.
+        """
         wanted = self.topics.keys() & (self.topics if topics is None else {*topics})
         start, stop = START if start_ns is None else start_ns, END if stop_ns is None else stop_ns
-        return in_time_order(
+        return merge_streams(
             (file.times[0], partial(self._of_file, path, file, wanted, start, stop))
             for path, file in self.files
             if file.times and file.times[0] < stop and start <= file.times[1])
@@ -279,39 +294,42 @@ class Bag:
             return
         found = Counter[int]()
         try:
-            for topic, time, data in file.messages(names, start, stop):
-                found[topic] += 1
-                yield names[topic], time, decompress_message(data)
-            for said in file.topics if start <= self.start_ns and stop == END else ():
-                if said.id in names and said.messages != found[said.id]:
-                    raise ValueError(f"it says {said.messages} messages on {said.name} and holds "
-                                     f"{found[said.id]}")
-        except Exception as error:  # zstd, struct, SQLite and rosbags raise their own
-            raise InputError(damaged(path, error)) from None
+            for topic_id, time, data in file.messages(names, start, stop):
+                found[topic_id] += 1
+                yield names[topic_id], time, decompress_message(data)
+            for topic in file.topics if start <= self.start_ns and stop == END else ():
+                if topic.id in names and topic.messages != found[topic.id]:
+                    raise ValueError(f"it declares {topic.messages} messages on {topic.name} and "
+                                     f"has {found[topic.id]}")
+        except Exception as error:  # zstd, struct, SQLite and rosbags raise their own types
+            raise InputError(describe_damage(path, error)) from None
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
-        """Yield (topic, time, message of rosbags' class) in order of time."""
-        for topic, stamp, data in self.raw(topics):
+        """Yield (topic, time in ns, message of rosbags' class) in order of time."""
+        for topic, stamp, data in self.raw_messages(topics):
             try:
                 yield topic, stamp, decode(data, self.topics[topic])
             except InputError as error:
                 raise InputError(f"{self.path}, topic {topic} at {stamp} ns: {error}") from None
 
 
-class KeptOpen:
-    """A bag that stays open for whoever reads single messages of it: to open one takes as long as
-    its index, which grows with the bag. Each process and each thread has its own, as SQLite wants
-    it; they are closed with their thread, or when nobody has this any more. The first one warns."""
+class BagHandle:
+    """A bag that is opened once and stays open, for reading single messages.
+
+    Opening a bag takes as long as reading its index, which grows with the bag. Each process and
+    each thread has its own open bag, as SQLite requires; it is closed with the thread, or when the
+    handle is deleted. Only the first one warns.
+    """
 
     def __init__(self, path: Path, warn: bool = True):
         self.path, self.warn, self.here = path, warn, threading.local()
 
-    def __reduce__(self) -> tuple[type[KeptOpen], tuple[Path, bool]]:
-        return KeptOpen, (self.path, False)
+    def __reduce__(self) -> tuple[type[BagHandle], tuple[Path, bool]]:
+        return BagHandle, (self.path, False)
 
     def bag(self) -> Bag:
-        """The bag, opened by the first call of this thread."""
-        if getattr(self.here, "process", None) != os.getpid():  # a fork shares what was open
+        """Return the bag, opened by the first call in this thread."""
+        if getattr(self.here, "process", None) != os.getpid():  # a fork shares open files
             self.here.bag, self.here.process = Bag(self.path, warn=self.warn), os.getpid()
             self.warn = False
         bag: Bag = self.here.bag

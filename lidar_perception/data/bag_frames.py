@@ -1,4 +1,4 @@
-"""The clouds of a bag as labelled frames, with the labels and the camera that lie beside them."""
+"""Clouds of a bag as frames, with the labels, camera and poses on its other topics."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.camera import Calibration
-from lidar_perception.data.bag import Bag, KeptOpen
+from lidar_perception.data.bag import Bag, BagHandle
 from lidar_perception.data.bag_metadata import NAME
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.cloud_files import is_cloud
@@ -29,8 +29,8 @@ from lidar_perception.data.frame import (
     PointTruth,
     Recording,
 )
-from lidar_perception.data.open_storage import storage_files
-from lidar_perception.data.recorded_scale import MAX_READ, scale_of
+from lidar_perception.data.open_storage import list_storage_files
+from lidar_perception.data.recorded_scale import MAX_READ, infer_scale
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.clouds import (
     CLOUD_TYPES,
@@ -50,75 +50,80 @@ from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, INSTANCE, POIN
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import SECOND
 
-# What is known by these topics
-BESIDE = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}}
+# Topics that a bag needs for each kind of content
+TOPICS_BY_CONTENT = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}}
 
 
-def recognises(path: Path) -> bool:
-    """Whether a bag lies there: a file, or a folder with one."""
+def is_layout(path: Path) -> bool:
+    """Return True for a bag file, or a folder with one."""
     if path.is_file():
-        return not is_cloud(path)  # nothing else is one file
-    return (path / NAME).is_file() or bool(storage_files(path))
+        return not is_cloud(path)  # all other layouts are folders
+    return (path / NAME).is_file() or bool(list_storage_files(path))
 
 
-def cloud_topic(bag: Bag, points: str = "") -> str:
-    """The topic of a bag to take the clouds from: points, where one is named, else /points, else
-    the only one with clouds. InputError where there is none, or several."""
-    every = find_cloud_topics(bag.topics)
-    clouds = [topic for topic in every if bag.counts[topic]]
-    if not points and POINTS not in clouds and len(clouds) > 1:
-        raise InputError(f"{bag.path} has clouds on {', '.join(clouds)}; name the topic of one, as "
-                         f"in {bag.path}:{clouds[0]}")
-    if not points and not every:
+def choose_cloud_topic(bag: Bag, points: str = "") -> str:
+    """Return the topic to read clouds from: `points` if given, else /points, else the only one.
+
+    Raises InputError if there is no such topic, or if the choice is ambiguous.
+    """
+    cloud_topics = find_cloud_topics(bag.topics)
+    recorded = [topic for topic in cloud_topics if bag.counts[topic]]
+    if not points and POINTS not in recorded and len(recorded) > 1:
+        raise InputError(f"{bag.path} has clouds on {', '.join(recorded)}; choose a topic, as in "
+                         f"{bag.path}:{recorded[0]}")
+    if not points and not cloud_topics:
         others = {name: topic.type for name, topic in bag.unreadable.items()} | bag.topics
         raise InputError(f"{bag.path} has no sensor_msgs/PointCloud2 and no other clouds: "
                          + (diagnose_packets(others) or f"it has {bag.content}. Record the cloud "
                             "topic of the sensor's driver"))
-    chosen = points or (clouds[0] if clouds and POINTS not in clouds else POINTS)
+    chosen = points or (recorded[0] if recorded and POINTS not in recorded else POINTS)
     bag.require(chosen)
     if bag.topics[chosen] not in CLOUD_TYPES:
-        raise InputError(f"{bag.path} has {bag.topics[chosen]} on {chosen}, no clouds; "
+        raise InputError(f"{bag.path} has {bag.topics[chosen]} on {chosen} instead of clouds; "
                          + (diagnose_packets({chosen: bag.topics[chosen]})
-                            or f"name another topic, as in {bag.path}:/points"))
+                            or f"choose another topic, as in {bag.path}:/points"))
     return chosen
 
 
-def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """Frames of the clouds on a topic, see cloud_topic."""
-    opened = KeptOpen(path)
-    bag = opened.bag()
-    points = cloud_topic(bag, points)
+def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
+    """Open the clouds on a topic of a bag, see choose_cloud_topic."""
+    handle = BagHandle(path)
+    bag = handle.bag()
+    points = choose_cloud_topic(bag, points)
     topics = {topic for topic, count in bag.counts.items() if count}
-    frames = BagFrames(opened, points, bag.topics[points], bag.counts[points])
-    labelled = False
+    frames = BagFrames(handle, points, bag.topics[points], bag.counts[points])
+    has_point_labels = False
     frames.check_readable()
-    with suppress(InputError):  # a damaged cloud is named when it is read
-        labelled = frames.first is not None and frames.labelled(frames.first[1]) is not None
-    has = frozenset(what for what, needed in BESIDE.items() if needed <= topics) | {
-        *[POINT_LABELS] * labelled, *[POSES] * frames.poses.known}
-    return Recording(path, f"{bag.layout}, clouds on {points}", frames, has, mounted=False,
-                     timed=True)
+    with suppress(InputError):  # a damaged cloud is reported when it is read
+        has_point_labels = (frames.first is not None
+                            and frames.decode_labelled(frames.first[1]) is not None)
+    has = frozenset(kind for kind, needed in TOPICS_BY_CONTENT.items() if needed <= topics) | {
+        *[POINT_LABELS] * has_point_labels, *[POSES] * frames.poses.available}
+    return Recording(path, f"{bag.layout}, clouds on {points}", frames, has,
+                     has_sensor_height=False, has_times=True)
 
 
 class BagFrames(Sequence):
-    """The frames in order of time; native() of each gives its message. Iterating reads the bag
-    once, and each frame holds its cloud. So does the first one by its number; another one by its
-    number reads it when it is asked for, found by its time after one look through the bag for the
-    times of all."""
+    """The frames of a bag in order of time; native() of a frame returns its message.
 
-    def __init__(self, opened: KeptOpen, points: str, kind: str, count: int,
+    Iterating reads the bag once, and each frame holds its cloud; so does frame 0. Any other frame
+    that is accessed by index reads its cloud when it is needed. The first such access reads the
+    times of all clouds.
+    """
+
+    def __init__(self, handle: BagHandle, points: str, kind: str, count: int,
                  sensor_height: float = SENSOR_HEIGHT):
-        self.opened, self.points, self.kind, self.clouds = opened, points, kind, count
-        self.path, self.sensor_height = opened.path, sensor_height
+        self.handle, self.points, self.kind, self.clouds = handle, points, kind, count
+        self.path, self.sensor_height = handle.path, sensor_height
 
     def mounted_at(self, sensor_height: float) -> BagFrames:
-        """The frames of a sensor at that height."""
-        return BagFrames(self.opened, self.points, self.kind, self.clouds, sensor_height)
+        """Return the frames with another sensor height above the ground, in metres."""
+        return BagFrames(self.handle, self.points, self.kind, self.clouds, sensor_height)
 
     def check_readable(self) -> None:
-        """Raise InputError if the clouds are compressed in a way that is not read."""
+        """Raise InputError if the compression of the clouds is not supported."""
         if self.first is not None:
-            with self._named(self.first[0]):
+            with self._error_context(self.first[0]):
                 check_readable(self.first[1], self.kind)
 
     def __len__(self) -> int:
@@ -127,17 +132,17 @@ class BagFrames(Sequence):
     def __iter__(self) -> Iterator[Frame]:
         names: Counter[int] = Counter()
         with Bag(self.path, warn=False) as bag:
-            for i, (_, time, data) in enumerate(bag.raw({self.points})):
+            for i, (_, time, data) in enumerate(bag.raw_messages({self.points})):
                 stamp = self._stamp(data, time)
                 names[stamp] += 1
                 yield self._frame(i, time, stamp, names[stamp], partial(bytes, data))
 
     def stamps(self) -> np.ndarray:
-        """(count,) int64 ns: the stamps of all clouds, after one look through the bag."""
+        """Return the stamps (count,) int64 ns of all clouds. Reads the whole bag once."""
         return np.array([row[2] for row in self._index], np.int64)
 
     def message(self, i: int) -> Any:
-        """Cloud i as a PointCloud2 with all the columns that were recorded."""
+        """Return cloud i as a PointCloud2 with all recorded columns."""
         time, before, *_ = self._index[i]
         return decode_cloud(self._read(time, before), self.kind)
 
@@ -150,17 +155,17 @@ class BagFrames(Sequence):
         if i == 0 and self.first is not None:
             time, data = self.first
             return self._frame(0, time, self._stamp(data, time), 1, lambda: data)
-        time, before, stamp, which = self._index[i]
-        return self._frame(i, time, stamp, which, partial(self._read, time, before))
+        time, before, stamp, occurrence = self._index[i]
+        return self._frame(i, time, stamp, occurrence, partial(self._read, time, before))
 
     @cached_property
     def _index(self) -> list[tuple[int, int, int, int]]:
-        """Of each cloud: time, clouds of the same time before it, stamp, clouds of the same stamp
-        up to it."""
+        """Per cloud: time, number of earlier clouds with the same time, stamp, and number of clouds
+        with the same stamp up to this one."""
         times: Counter[int] = Counter()
         names: Counter[int] = Counter()
         rows = []
-        for _, time, data in self.opened.bag().raw({self.points}):
+        for _, time, data in self.handle.bag().raw_messages({self.points}):
             stamp = self._stamp(data, time)
             names[stamp] += 1
             rows.append((time, times[time], stamp, names[stamp]))
@@ -168,22 +173,24 @@ class BagFrames(Sequence):
         return rows
 
     def _read(self, time: int, before: int) -> bytes:
-        messages = self.opened.bag().raw({self.points}, time, time + 1)
+        messages = self.handle.bag().raw_messages({self.points}, time, time + 1)
         return next(islice(messages, before, None))[2]
 
     @cached_property
-    def _beside(self) -> tuple[dict[int, GroundTruth], list, list]:
-        """Labels by stamp, and calibrations and transforms by time: they are small, and may come
-        after their cloud."""
+    def _annotations(self) -> tuple[dict[int, GroundTruth], list, list]:
+        """Labels by stamp, and calibrations and transforms by time.
+
+        They are small, and may come after their cloud.
+        """
         truth: dict[int, GroundTruth] = {}
         infos: list[tuple[int, Any]] = []
         transforms: list[tuple[int, Any]] = []
-        bag = self.opened.bag()
+        bag = self.handle.bag()
         for topic, time, msg in bag.messages({TRUTH, CAMERA_INFO, EXTRINSICS} & {*bag.topics}):
             if topic == TRUTH:
                 objects = from_marker_array(msg)
                 truth[objects.stamp_ns or time] = to_truth(objects)
-                if not objects.stamp_ns:  # of a cloud without a stamp, or where time begins
+                if not objects.stamp_ns:  # a cloud without a stamp, or the start of simulated time
                     truth.setdefault(0, truth[time])
             else:
                 (infos if topic == CAMERA_INFO else transforms).append((time, msg))
@@ -191,7 +198,7 @@ class BagFrames(Sequence):
 
     @cached_property
     def files(self) -> tuple[Path, ...]:
-        """That hold its messages."""
+        """Storage files of the bag."""
         if self.path.is_file():
             return self.path,
         return tuple(sorted(file for file in self.path.iterdir()
@@ -199,42 +206,48 @@ class BagFrames(Sequence):
 
     @cached_property
     def first(self) -> tuple[int, bytes] | None:
-        """Time of the first cloud, and it, serialised; None where there is none."""
-        raw = self.opened.bag().raw({self.points})
+        """Time and serialized message of the first cloud; None without clouds."""
+        raw = self.handle.bag().raw_messages({self.points})
         return next(((time, bytes(data)) for _, time, data in raw), None)
 
     def _stamp(self, data: bytes, time: int) -> int:
-        """Return the header.stamp of a serialised cloud; its time in the bag if no cloud has one,
-        or if it is too short for one."""
-        if (stamp := _header_stamp(data)) == 0 and self._unstamped:
+        """Return header.stamp of a serialized cloud, in ns.
+
+        If all clouds of the bag lack a stamp, or the message is too short, return its time in the
+        bag.
+        """
+        if (stamp := _read_header_stamp(data)) == 0 and self._has_no_stamps:
             stamp = None
         return time if stamp is None else stamp
 
     @cached_property
-    def _unstamped(self) -> bool:
-        """True if all stamps are 0; some are where simulated time begins."""
-        return not any(_header_stamp(data) for *_, data in self.opened.bag().raw({self.points}))
+    def _has_no_stamps(self) -> bool:
+        """True if all stamps are 0; a few are at the start of simulated time."""
+        messages = self.handle.bag().raw_messages({self.points})
+        return not any(_read_header_stamp(data) for *_, data in messages)
 
     @cached_property
     def full_scale(self) -> float:
-        """The intensity of a full reflection, by the first clouds, as only they can be read without
-        a look through the bag; the same for all frames."""
-        return scale_of(self._first_clouds(),
-                        lambda data: read_raw_intensity(decode_cloud(data, self.kind)))
+        """Intensity of a full reflection, from the first clouds; the same for all frames.
+
+        The first clouds are the only ones that are read without reading the whole bag.
+        """
+        return infer_scale(self._first_clouds(),
+                           lambda data: read_raw_intensity(decode_cloud(data, self.kind)))
 
     def _first_clouds(self) -> Iterator[bytes]:
-        with suppress(InputError):  # damage is named when it is read
-            for _, _, data in islice(self.opened.bag().raw({self.points}), MAX_READ):
+        with suppress(InputError):  # damage is reported when the frame is read
+            for _, _, data in islice(self.handle.bag().raw_messages({self.points}), MAX_READ):
                 yield bytes(data)
 
     @cached_property
     def poses(self) -> BagPoses:
-        """Of the frame that the first cloud is in."""
-        return BagPoses(self.opened, _frame_id(self.first[1]) if self.first else "")
+        """Poses of the frame_id of the first cloud."""
+        return BagPoses(self.handle, _read_frame_id(self.first[1]) if self.first else "")
 
-    def _frame(self, i: int, time: int, stamp: int, which: int,
+    def _frame(self, i: int, time: int, stamp: int, occurrence: int,
                data: Callable[[], bytes]) -> Frame:
-        name = str(stamp) if which == 1 else f"{stamp}-{which}"  # recorders may not set the stamp
+        name = str(stamp) if occurrence == 1 else f"{stamp}-{occurrence}"  # stamps may repeat
         return Frame(name, stamp, partial(self._load, time, data), partial(self._truth, stamp),
                      point_truth=partial(self._point_truth, time, data),
                      calibration=partial(self._calibration, time),
@@ -243,20 +256,19 @@ class BagFrames(Sequence):
                      intensity_max=lambda: self.full_scale)
 
     def _load(self, time: int, data: Callable[[], bytes]) -> LidarFrame:
-        with self._named(time):
+        with self._error_context(time):
             return to_frame(decode_cloud(data(), self.kind), self.full_scale)[0]
 
     @contextmanager
-    def _named(self, time: int) -> Iterator[None]:
-        """Say in an InputError which cloud it is about."""
+    def _error_context(self, time: int) -> Iterator[None]:
+        """Add the cloud's topic and time to an InputError."""
         try:
             yield
         except InputError as error:
             raise InputError(f"{self.path}, topic {self.points} at {time} ns: {error}") from None
 
-    def labelled(self, data: bytes) -> Any:
-        """A serialised cloud, decoded, if it has labels of its points; None otherwise, and if it is
-        broken."""
+    def decode_labelled(self, data: bytes) -> Any:
+        """Decode a serialized cloud with point labels; None if it has none or is malformed."""
         with suppress(InputError):
             msg = decode_cloud(data, self.kind)
             if {SEMANTIC, INSTANCE} <= {f.name for f in msg.fields}:
@@ -264,40 +276,41 @@ class BagFrames(Sequence):
         return None
 
     def _point_truth(self, time: int, data: Callable[[], bytes]) -> PointTruth | None:
-        if (msg := self.labelled(data())) is None:
+        if (msg := self.decode_labelled(data())) is None:
             return None
-        with self._named(time):
+        with self._error_context(time):
             indices = to_frame(msg)[1]
             classes, instances = (read_column(msg, name, indices) for name in (SEMANTIC, INSTANCE))
-        assert classes is not None and instances is not None  # labelled() has seen both
+        assert classes is not None and instances is not None  # see decode_labelled
         return PointTruth(classes.astype(np.uint16), instances.astype(np.uint16))
 
     def _truth(self, stamp: int) -> GroundTruth | None:
-        return self._beside[0].get(stamp)
+        return self._annotations[0].get(stamp)
 
     def _calibration(self, time: int) -> Calibration | None:
-        _, infos, transforms = self._beside
-        info, transform = _latest(infos, time), _latest(transforms, time)
+        _, infos, transforms = self._annotations
+        info, transform = _find_latest(infos, time), _find_latest(transforms, time)
         return read_calibration(info, transform) if info and transform else None
 
 
-def _header_stamp(data: bytes) -> int | None:
-    """header.stamp of a serialised message in ns; None if it is too short for one."""
+def _read_header_stamp(data: bytes) -> int | None:
+    """Return header.stamp of a serialized message in ns; None if the message is too short."""
     if len(data) < 12:
         return None
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return int(seconds * SECOND + nanoseconds)
 
 
-def _frame_id(data: bytes) -> str:
-    """header.frame_id of a serialised message; "" if it is too short to have one."""
+def _read_frame_id(data: bytes) -> str:
+    """Return header.frame_id of a serialized message; "" if the message is too short."""
     if len(data) < 16:
         return ""
     size, = struct.unpack_from("<I" if data[1] & 1 else ">I", data, 12)
     return bytes(data[16:16 + size]).rstrip(b"\0").decode(errors="replace")
 
 
-def _latest(messages: list, time: int) -> Any:
-    """The last message up to a time, or else the first: latched topics hold from the start."""
+def _find_latest(messages: list, time: int) -> Any:
+    """Return the last message up to a time, or the first one: latched topics hold from the
+    start."""
     after = bisect_right(messages, time, key=itemgetter(0))
     return messages[max(after - 1, 0)][1] if messages else None

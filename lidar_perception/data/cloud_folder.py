@@ -1,4 +1,4 @@
-"""Folders of .pcd, .ply, .npy or .bin files, as drivers and labelling tools write them."""
+"""Folders of .pcd, .ply, .npy or .bin files, as written by drivers and labelling tools."""
 
 from __future__ import annotations
 
@@ -9,78 +9,92 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.data.cloud_files import cloud_scale, is_cloud, load_points, to_message
+from lidar_perception.data.cloud_files import (
+    is_cloud,
+    load_points,
+    make_cloud_scale_reader,
+    to_message,
+)
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS
 
-UNITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}  # digits of a Unix time of today: ns of its unit
+UNIT_NS_BY_DIGITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}  # by the digits of a Unix time
 NANOSECOND_DIGITS = 9
 
 
-def cloud_files(path: Path) -> list[Path]:
-    """List the file at a path, or those in the folder, in order of the times that their names give,
-    else of the numbers in their names (2 before 10); empty where there is no cloud."""
+def list_cloud_files(path: Path) -> list[Path]:
+    """Return the point cloud files at a path: the file itself, or those in a folder.
+
+    They are in order of the times in their names, else of the numbers in their names (2 before 10).
+    """
     files = [file for file in ([path] if path.is_file() else path.glob("*")) if is_cloud(file)]
-    if stamps := _stamps(files):
+    if stamps := _parse_stamps(files):
         return [file for _, file in sorted(zip(stamps, files))]
     return sorted(files, key=lambda file: [
         (int(part or -1), text) for text, part in re.findall(r"(\D*)(\d*)", file.name)])
 
 
-def recognises(path: Path) -> bool:
-    """Return True for such a file, or a folder with some."""
-    return bool(cloud_files(path))
+def is_layout(path: Path) -> bool:
+    """Return True for a point cloud file, or a folder with some."""
+    return bool(list_cloud_files(path))
 
 
-def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """Open the clouds as one drive without labels. Times are those that all names say (Unix times
-    in seconds, as 1700000000.1, or in ms, us or ns), else 10 Hz."""
-    files = cloud_files(path)
+def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
+    """Open the clouds as one drive without labels.
+
+    Stamps are the Unix times in the names of the files (in seconds, as 1700000000.1, or in ms, us
+    or ns) if all have one; otherwise a rate of 10 Hz is assumed.
+    """
+    files = list_cloud_files(path)
     names = [file.stem for file in files]
     if len(set(names)) < len(names):
         names = [file.name for file in files]
-    times = named_times(files)
+    times = parse_times(files)
     stamps = times or [START_NS + i * PERIOD_NS for i in range(len(files))]
     kinds = " and ".join(sorted({file.suffix.lower() for file in files}))
-    scale = cloud_scale(files)
-    return Recording(path, f"{kinds} clouds, {'times' if times else 'no times'} in their names",
+    scale = make_cloud_scale_reader(files)
+    return Recording(path, f"{kinds} clouds, {'times' if times else 'no times'} in file names",
                      [Frame(name, stamp, partial(load_points, file, stamp, scale=scale), index=i,
                             points=file, native=partial(to_message, file, stamp),
                             intensity_max=scale)
                       for i, (name, stamp, file) in enumerate(zip(names, stamps, files))],
-                     mounted=False, timed=bool(times))
+                     has_sensor_height=False, has_times=bool(times))
 
 
-def named_times(files: list[Path]) -> list[int]:
-    """Return the nanoseconds that the names of the files give, ascending; empty where one gives
-    none."""
-    stamps = _stamps(files)
+def parse_times(files: list[Path]) -> list[int]:
+    """Return the times in the names of files in ns; empty if one has none, or if they do not
+    ascend."""
+    stamps = _parse_stamps(files)
     return stamps if all(a < b for a, b in pairwise(stamps)) else []
 
 
-def _stamps(files: list[Path]) -> list[int]:
-    """Nanoseconds in the names of the files, one for each; empty where one has none."""
-    parts = [part for file in files if (part := _parts(file)) is not None]
+def _parse_stamps(files: list[Path]) -> list[int]:
+    """Return the times in the names of files in ns; empty if one has none."""
+    parts = [part for file in files if (part := _split_name(file)) is not None]
     if len(parts) < len(files):
         return []
     fractions = [fraction for _, fraction in parts]
-    decimal = [whole + int(f"{fraction:0<9}"[:9]) for whole, fraction in parts]
-    # Up to perception_pcl 2.6.2, pointcloud_to_pcd wrote SECONDS.NANOSECONDS without leading zeros:
+    as_decimals = [whole + int(f"{fraction:0<9}"[:9]) for whole, fraction in parts]
+    # Until perception_pcl 2.6.2, pointcloud_to_pcd wrote SECONDS.NANOSECONDS without leading zeros:
     # https://github.com/ros-perception/perception_pcl/pull/481
     shorter = [f for f in fractions if len(f) < NANOSECOND_DIGITS]
     if not shorter or len(shorter) == len(fractions) or any(
             (f.startswith("0") and f != "0") or len(f) > NANOSECOND_DIGITS for f in fractions):
-        return decimal
-    counted = [whole + int(fraction or 0) for whole, fraction in parts]
-    uneven = [np.ptp(np.diff(sorted(stamps))) for stamps in (decimal, counted)]
-    return counted if any(f.endswith("0") for f in shorter) or uneven[1] < uneven[0] else decimal
+        return as_decimals
+    as_nanoseconds = [whole + int(fraction or 0) for whole, fraction in parts]
+    spreads = [np.ptp(np.diff(sorted(stamps))) for stamps in (as_decimals, as_nanoseconds)]
+    if any(f.endswith("0") for f in shorter) or spreads[1] < spreads[0]:
+        return as_nanoseconds
+    return as_decimals
 
 
-def _parts(file: Path) -> tuple[int, str] | None:
-    """Nanoseconds before the point in the name of a file, and the digits behind it; None where it
-    is no time: a frame of KITTI's raw data has ten digits, too, the first of them 0."""
+def _split_name(file: Path) -> tuple[int, str] | None:
+    """Return the time before the point in the name of a file in ns, and the digits after the point.
+
+    None if it is not a time. KITTI's raw frames have ten digits, too, but start with 0.
+    """
     whole, _, fraction = file.name.removesuffix(file.suffix).partition(".")
-    if not whole.isdecimal() or whole[0] == "0" or len(whole) not in UNITS or (
+    if not whole.isdecimal() or whole[0] == "0" or len(whole) not in UNIT_NS_BY_DIGITS or (
             fraction and (len(whole) != 10 or not fraction.isdecimal())):
         return None
-    return int(whole) * UNITS[len(whole)], fraction
+    return int(whole) * UNIT_NS_BY_DIGITS[len(whole)], fraction

@@ -1,6 +1,6 @@
-"""One labelled frame: what every data set, bag and simulated drive gives, and all that loops know.
+"""Frames and recordings: the common form of all data sets, bags and simulated drives.
 
-Nothing is read before it is asked for, so a list of a whole data set costs its file names.
+Files are read when their content is used, so a list of all frames needs the file names only.
 """
 
 from __future__ import annotations
@@ -20,43 +20,57 @@ from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, Lidar
 
 @dataclass(frozen=True)
 class PointTruth:
-    """Labels of the N points of a frame: classes (N,) uint16 as in SemanticKITTI (0 = unlabelled),
-    instances (N,) uint16 (0 = none)."""
+    """Labels of the N points of a frame.
+
+    Attributes:
+        classes: (N,) uint16, numbered as in SemanticKITTI; 0 = unlabelled.
+        instances: (N,) uint16, 0 = none.
+    """
 
     classes: np.ndarray
     instances: np.ndarray
 
 
-def nothing() -> None:
-    """Return None for data that the recording does not contain."""
+def return_none() -> None:
+    """Return None, for data that a recording does not contain."""
 
 
 def fixed_scale() -> float:
-    """Return 0, for clouds whose format fixes the scale of the intensity."""
+    """Return 0, for formats that define the scale of the intensity."""
     return 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One scan of a recording. Each function reads its file when it is called, and raises
-    InputError naming the file where it is missing or broken.
+    """One scan of a recording.
 
-    name: unlike that of any other frame of the recording. load() gives the usable points.
-    truth(): labelled objects in the LiDAR frame; point_truth(): labels of the points of load();
-    calibration(): of the camera; pose(): (4, 4) float64 from the frame to a fixed one, metres;
-    each None where there is none. sequence: the drive it belongs to, "" without drives; index: its
-    number there. sensor_height: metres above the ground. points, image: files, where there are
-    any. files: those that its points, labels and calibration are read from, there or not; () where
-    nobody can know what was labelled. native: what the protocol of this data set alone asks for.
+    Its functions read files when they are called. They raise InputError that names the file if it
+    is missing or malformed.
+
+    Attributes:
+        name: unique within the recording.
+        load: returns the usable points.
+        truth: returns the labelled objects in the LiDAR frame, or None.
+        point_truth: returns the labels of the points of load(), or None.
+        calibration: returns the calibration of the camera, or None.
+        pose: returns the pose (4, 4) float64 of the LiDAR in a fixed frame, metres, or None.
+        sequence: name of the drive, "" without drives.
+        index: number of the frame in its drive.
+        sensor_height: metres above the ground.
+        points, image: files, or None.
+        files: all files that points, labels and calibration are read from, existing or not; () if
+            labels cannot be attributed to files.
+        native: data that only the evaluation protocol of this data set needs.
+        intensity_max: returns the intensity of a full reflection; 0 if the format defines it.
     """
 
     name: str
     stamp_ns: int
     load: Callable[[], LidarFrame]
-    truth: Callable[[], GroundTruth | None] = nothing
-    point_truth: Callable[[], PointTruth | None] = nothing
-    calibration: Callable[[], Calibration | None] = nothing
-    pose: Callable[[], np.ndarray | None] = nothing
+    truth: Callable[[], GroundTruth | None] = return_none
+    point_truth: Callable[[], PointTruth | None] = return_none
+    calibration: Callable[[], Calibration | None] = return_none
+    pose: Callable[[], np.ndarray | None] = return_none
     sequence: str = ""
     index: int = 0
     sensor_height: float = SENSOR_HEIGHT
@@ -67,31 +81,33 @@ class Frame:
     intensity_max: Callable[[], float] = fixed_scale
 
     def camera(self) -> Camera | None:
-        """The camera that sees the frame; None without a calibration."""
+        """Return the camera that sees the frame; None without a calibration."""
         calibration = self.calibration()
         return None if calibration is None else calibration.camera()
 
-    def loaded_once(self) -> Frame:
-        """The same frame, whose scan is read once and kept as long as the frame is."""
+    def with_cached_scan(self) -> Frame:
+        """Return the same frame with a scan that is read once and kept in memory."""
         return replace(self, load=cache(self.load))
 
     @staticmethod
     def of(name: str, scan: LidarFrame, truth: GroundTruth | None = None,
            calibration: Calibration | None = None, **more: Any) -> Frame:
-        """A frame of what is in memory already."""
-        return Frame(name, scan.stamp_ns, partial(_given, scan), partial(_given, truth),
-                     calibration=partial(_given, calibration), **more)
+        """Make a frame of data in memory."""
+        return Frame(name, scan.stamp_ns, partial(_identity, scan), partial(_identity, truth),
+                     calibration=partial(_identity, calibration), **more)
 
 
-def frame_id_of(frames: Sequence[Frame]) -> str:
-    """The coordinate frame of their clouds, as the first one names it; "" where there is none, or
-    it cannot be read, which is said when it is asked for."""
+def read_frame_id(frames: Sequence[Frame]) -> str:
+    """Return the coordinate frame of the clouds, from the first one.
+
+    "" without frames, or if the first one cannot be read; whoever loads it gets the error.
+    """
     with suppress(InputError):
         return frames[0].load().frame_id if frames else ""
     return ""
 
 
-def _given(value: Any) -> Any:
+def _identity(value: Any) -> Any:
     return value
 
 
@@ -100,25 +116,29 @@ BOXES, POINT_LABELS, CAMERA, POSES = "labelled boxes", "labelled points", "a cam
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """The frames of a data set or a bag, in order of time within a drive.
+    """The frames of a data set or bag, in order of time within a drive.
 
-    layout: what was recognised, for people. has: which of BOXES, POINT_LABELS, CAMERA and POSES
-    some frames have. lost: labels whose scan is not there, name -> reason. reopen: opens the same
-    recording again, in another process, too; takes what data.open.open_recording does. mounted:
-    whether it says how high its sensor is; otherwise the sensor_height of its frames is KITTI's.
-    drives: whether frames follow each other in time; else they were drawn from anywhere. timed:
-    whether the stamps were recorded; else 10 Hz is assumed.
+    Attributes:
+        layout: description of the recognised layout.
+        has: those of BOXES, POINT_LABELS, CAMERA and POSES that some frames have.
+        missing_scans: (name, reason) of labels without a scan.
+        reopen: opens the same recording again, also in another process; takes the arguments of
+            data.open.open_recording.
+        has_sensor_height: the recording states the height of its sensor; otherwise the
+            sensor_height of its frames is KITTI's.
+        is_sequential: frames follow each other in time; otherwise they are unrelated.
+        has_times: stamps were recorded; otherwise 10 Hz is assumed.
     """
 
     path: Path
     layout: str
     frames: Sequence[Frame]
     has: frozenset[str] = frozenset()
-    lost: tuple[tuple[str, str], ...] = ()
+    missing_scans: tuple[tuple[str, str], ...] = ()
     reopen: Callable[..., Recording] | None = None
-    mounted: bool = True
-    drives: bool = True
-    timed: bool = False
+    has_sensor_height: bool = True
+    is_sequential: bool = True
+    has_times: bool = False
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -127,20 +147,25 @@ class Recording:
         return iter(self.frames)
 
     def __str__(self) -> str:
-        """One line for people."""
+        """Return one line that describes the recording."""
         count = f"{len(self)} frame{'' if len(self) == 1 else 's'}"
         return ", ".join((f"{self.path}: {self.layout}", count, *sorted(self.has)))
 
-    def require(self, what: str, verb: str) -> None:
-        """InputError naming the verb if no frame can have what it needs, of BOXES and so on."""
-        if what not in self.has:
-            raise InputError(f"{self.path} ({self.layout}) has no {what.removeprefix('a ')}, which "
-                             f"{verb} needs")
+    def require(self, content: str, verb: str) -> None:
+        """Raise InputError if no frame has the given content, which `verb` needs.
 
-    def chosen(self, names: Sequence[str]) -> Recording:
-        """The frames of these names, in their order. InputError names what is not there."""
+        `what` is one of BOXES, POINT_LABELS, CAMERA and POSES.
+        """
+        if content not in self.has:
+            raise InputError(f"{self.path} ({self.layout}) has no {content.removeprefix('a ')}, "
+                             f"which {verb} needs")
+
+    def select(self, names: Sequence[str]) -> Recording:
+        """Return the frames with these names, in this order. Raises InputError for unknown
+        names."""
         numbers = {frame.name: i for i, frame in enumerate(self.frames)}
         if unknown := [name for name in names if name not in numbers]:
-            raise InputError(f"{self.path} has no frame {unknown[0]} ({len(unknown)} such); its "
+            raise InputError(f"{self.path} has no frame {unknown[0]} ({len(unknown)} unknown); its "
                              f"first is {next(iter(numbers), 'none')}")
-        return replace(self, frames=[self.frames[numbers[name]] for name in names], lost=())
+        return replace(self, frames=[self.frames[numbers[name]] for name in names],
+                       missing_scans=())

@@ -1,4 +1,5 @@
-"""The frames of a robot's sensor as its nodes see them: level, x ahead, without the robot."""
+"""Frames of a sensor in any mounting, converted to the input of the nodes: level, x ahead,
+cropped."""
 
 from __future__ import annotations
 
@@ -20,11 +21,16 @@ from lidar_perception.wire.topics import LIDAR_FRAME
 
 
 @dataclass(frozen=True)
-class Robot:
-    """How a sensor is mounted and read, as the parameters of nodes have it. height: metres above
-    the ground, None what the recording says; roll, pitch: of the sensor, as a URDF's rpy, and
-    ahead: counter-clockwise from its x axis, rad; crop: its body in the sensor's coordinates;
-    intensity_max: the value of a full reflection, 0 as the recording has it."""
+class SensorMount:
+    """Mounting of a sensor, and how its clouds are read; values are those of the node parameters.
+
+    Attributes:
+        height: metres above the ground; None: as stated by the recording.
+        roll, pitch: of the sensor, radians, as in a URDF's rpy.
+        ahead: direction of travel, counter-clockwise from the sensor's x axis, radians.
+        crop: the robot's body in sensor coordinates.
+        intensity_max: intensity of a full reflection; 0: as in the recording.
+    """
 
     height: float | None = None
     roll: float = 0.0
@@ -34,53 +40,57 @@ class Robot:
     intensity_max: float = 0.0
 
 
-def levelled(frame: Frame, robot: Robot, poses: PoseLookup | None = None) -> Frame:
-    """A frame of a bag or a file, whose native() gives its message, as a level sensor at the same
-    place would give it, with x ahead. Labels, camera and pose move along; boxes stay upright. Where
-    anything is turned the frame_id has _level behind it.
+def level_frame(frame: Frame, mount: SensorMount, poses: PoseLookup | None = None) -> Frame:
+    """Return a frame of a bag or file as a level sensor at the same place would give it, x ahead.
 
-    poses: of the sensor (M, 4, 4) at times (M,) ns; with them points are moved to the stamp first,
-    as input.deskew does. InputError of load() where one of these is not known, or the cloud has no
-    times."""
-    level = find_level_transform(make_tilted_pose(robot.roll, robot.pitch), robot.ahead)
-    back = np.eye(4) if level is None else invert_pose(level)
+    Labels, camera and pose are transformed along; boxes stay upright. If the cloud is rotated,
+    "_level" is appended to its frame_id.
+
+    Args:
+        frame: native() returns its message.
+        poses: returns the poses (M, 4, 4) of the sensor at times (M,) ns. If given, points are
+            moved to the stamp first, as input.deskew does; load() then raises InputError if a pose
+            is unknown, or if the cloud has no time column.
+    """
+    rotation = find_level_transform(make_tilted_pose(mount.roll, mount.pitch), mount.ahead)
+    inverse_rotation = np.eye(4) if rotation is None else invert_pose(rotation)
 
     def read() -> tuple[np.ndarray, LidarFrame]:
-        """indices of the points that are kept, and these."""
+        """Return the indices of the points that are kept, and these points."""
         message = frame.native()
-        scan, indices = to_frame(message, robot.intensity_max or frame.intensity_max())
-        kept, scan = crop_frame(scan, robot.crop, level=level)
+        scan, indices = to_frame(message, mount.intensity_max or frame.intensity_max())
+        kept, scan = crop_frame(scan, mount.crop, level=rotation)
         if poses is not None:
             scan = deskew_frame(message, scan, indices.take(kept), poses)
         return kept, scan
 
     def load() -> LidarFrame:
         scan = read()[1]
-        return scan if level is None else replace(
-            scan, xyz=transform_points(scan.xyz, level),
+        return scan if rotation is None else replace(
+            scan, xyz=transform_points(scan.xyz, rotation),
             frame_id=f"{scan.frame_id or LIDAR_FRAME}_level")
 
     def point_truth() -> PointTruth | None:
         labels = frame.point_truth()
-        if labels is None or not robot.crop.enabled:
+        if labels is None or not mount.crop.enabled:
             return labels
         kept, _ = read()
         return PointTruth(labels.classes[kept], labels.instances[kept])
 
     def truth() -> GroundTruth | None:
         labels = frame.truth()
-        return labels if labels is None or level is None else replace(
-            labels, boxes=transform_boxes(labels.boxes, level))
+        return labels if labels is None or rotation is None else replace(
+            labels, boxes=transform_boxes(labels.boxes, rotation))
 
     def calibration() -> Calibration | None:
         camera = frame.calibration()
         return None if camera is None else replace(
-            camera, lidar_to_camera=camera.lidar_to_camera @ back)
+            camera, lidar_to_camera=camera.lidar_to_camera @ inverse_rotation)
 
     def pose() -> np.ndarray | None:
-        at = frame.pose()
-        return None if at is None else at @ back
+        sensor_pose = frame.pose()
+        return None if sensor_pose is None else sensor_pose @ inverse_rotation
 
-    height = frame.sensor_height if robot.height is None else robot.height
+    height = frame.sensor_height if mount.height is None else mount.height
     return replace(frame, load=load, truth=truth, point_truth=point_truth, calibration=calibration,
                    pose=pose, sensor_height=height, points=None, native=None)

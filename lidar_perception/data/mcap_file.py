@@ -1,6 +1,6 @@
-"""MCAP files by any writer: with or without chunks, indexes, statistics and repeated channels.
+"""Reader of MCAP files, with or without chunks, indexes, statistics and repeated channels.
 
-Channels, counts and places of messages come from the data section. The summary at the end is
+Channels, counts and locations of messages come from the data section. The summary at the end is
 compared with it, so that damage in either is found. Format: https://mcap.dev/spec.
 """
 
@@ -20,29 +20,35 @@ import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.records import Channel, Schema
 
-from lidar_perception.data.storage import END, Stream, Topic, in_time_order
+from lidar_perception.data.storage import END, Stream, Topic, merge_streams
 from lidar_perception.wire.compression import MAX_BYTES, decompress
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, CHUNK_INDEX, DATA_END = 7, 8, 15
-HEAD_BYTES = 64  # of a record, looked at
-RECORD = struct.Struct("<BQ")  # of each: its kind, and how many bytes follow
+HEAD_BYTES = 64  # of a record that are read first
+RECORD = struct.Struct("<BQ")  # kind of a record, and number of bytes that follow
 FOOTER_BYTES = RECORD.size + 20
 NO_INDEX = (RECORD.pack(DATA_END, 4) + bytes(4) + RECORD.pack(FOOTER, 20) + bytes(20)
-            + MAGIC)  # the end of a file that has none
-MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, number, time of the recorder, of the sender
-ENTRY_BYTES = 16  # of a message index, for each message
-PLACE = np.dtype([("time", np.int64), ("channel", np.uint16), ("at", np.int64),
-                  ("bytes", np.int64)])
+            + MAGIC)  # end of a file without an index
+MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, number, log time, publish time
+ENTRY_BYTES = 16  # per message in a message index
+LOCATION = np.dtype([("time", np.int64), ("channel", np.uint16), ("at", np.int64),
+                     ("bytes", np.int64)])
 
 
 @dataclass
 class Chunk:
-    """place: what a chunk index says of it, see _indexed. start, end: times in its header. at: of
-    its compressed data in the file. counts: number of messages by channel."""
+    """A chunk of an MCAP file.
 
-    place: tuple[int, int, int, int, bytes, int, int]
+    Attributes:
+        index_entry: the chunk's entry in an index, see _parse_chunk_index.
+        start, end: times in its header, ns.
+        at: offset of its compressed data in the file.
+        counts: number of messages by channel.
+    """
+
+    index_entry: tuple[int, int, int, int, bytes, int, int]
     start: int
     end: int
     at: int
@@ -51,12 +57,16 @@ class Chunk:
 
 
 class McapFile:
-    """An MCAP file open for reading, see StorageFile. profile: what its messages are, as its writer
-    names it: ros2, ros1, or "".
+    """An MCAP file open for reading, see StorageFile.
 
-    To open it reads the summary and 64 bytes of each record outside of chunks, and unpacks only
+    Opening reads the summary and 64 bytes of each record outside of chunks. It decompresses only
     chunks that have no message index, or that define channels which the summary does not repeat.
-    ValueError where it is damaged.
+
+    Attributes:
+        profile: kind of its messages as given by the writer: ros2, ros1, or "".
+
+    Raises:
+        ValueError: the file is damaged.
     """
 
     def __init__(self, path: Path):
@@ -66,111 +76,113 @@ class McapFile:
         self.chunks: list[Chunk] = []
         self.profile = ""
         try:
-            summary_at, end, summary = self._summary()
-            self.places = self._look_through(summary_at or end)
-            self._take_summary(summary)
-            self._complete()
-            self.topics, self.times = self._topics(), self._times()
+            summary_at, end, summary = self._read_summary()
+            self.locations = self._scan_data_section(summary_at or end)
+            self._check_summary(summary)
+            self._complete_definitions()
+            self.topics, self.times = self._make_topics(), self._find_times()
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
-        """Close the file."""
         self.file.close()
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
-        """Yield (channel id, log time, data) of channels, start <= time < stop, in order of
+        """Yield (channel id, log time, data) of channels with start <= time < stop, in order of
         time."""
         wanted = {*ids}
         sources: list[tuple[int, Callable[[], Stream]]] = [
-            (chunk.start, partial(self._of_chunk, chunk, wanted, start, stop))
+            (chunk.start, partial(self._messages_in_chunk, chunk, wanted, start, stop))
             for chunk in self.chunks
             if chunk.start < stop and start <= chunk.end and not wanted.isdisjoint(chunk.counts)]
-        if len(self.places):
-            sources.append((int(self.places["time"][0]),
-                            partial(self._outside_chunks, wanted, start, stop)))
-        return in_time_order(sources)
+        if len(self.locations):
+            sources.append((int(self.locations["time"][0]),
+                            partial(self._messages_outside_chunks, wanted, start, stop)))
+        return merge_streams(sources)
 
-    def _of_chunk(self, chunk: Chunk, wanted: set[int], start: int, stop: int) -> Stream:
-        data, found = self._unpacked(chunk), []
-        for kind, at, length in _records(partial(_part, data), 0, len(data)):
+    def _messages_in_chunk(self, chunk: Chunk, wanted: set[int], start: int, stop: int) -> Stream:
+        data, found = self._read_chunk(chunk), []
+        for kind, at, length in _iterate_records(partial(_slice, data), 0, len(data)):
             if kind == MESSAGE:
                 channel, _, time, _ = MESSAGE_HEAD.unpack_from(data, at)
                 if not chunk.start <= time <= chunk.end:
-                    raise ValueError("a chunk of it has messages outside of its times")
+                    raise ValueError("a chunk has messages outside its time range")
                 if channel in wanted and start <= time < stop:
                     found.append((time, channel, at + MESSAGE_HEAD.size, at + length))
         found.sort(key=itemgetter(0))
         for time, channel, begin, end in found:
             yield channel, time, data[begin:end]
 
-    def _outside_chunks(self, wanted: set[int], start: int, stop: int) -> Stream:
-        begin, end = np.searchsorted(self.places["time"], (start, stop))
-        for time, channel, at, size in self.places[begin:end].tolist():
+    def _messages_outside_chunks(self, wanted: set[int], start: int, stop: int) -> Stream:
+        begin, end = np.searchsorted(self.locations["time"], (start, stop))
+        for time, channel, at, size in self.locations[begin:end].tolist():
             if channel in wanted:
                 yield channel, time, self._read(at, size)
 
     def _read(self, at: int, size: int) -> bytes:
         return os.pread(self.file.fileno(), size, at)
 
-    def _summary(self) -> tuple[int, int, bytes]:
-        """Return where the summary begins (0 without one) and the footer, and the summary."""
+    def _read_summary(self) -> tuple[int, int, bytes]:
+        """Return the offset of the summary (0 without one), that of the footer, and the summary."""
         size = os.fstat(self.file.fileno()).st_size
         end = size - len(MAGIC) - FOOTER_BYTES
         footer = self._read(max(end, 0), FOOTER_BYTES + len(MAGIC))
         if self._read(0, len(MAGIC)) != MAGIC or end < len(MAGIC) or not footer.endswith(MAGIC) \
                 or RECORD.unpack_from(footer) != (FOOTER, 20):
-            raise ValueError("it has no footer")
+            raise ValueError("the footer is missing")
         summary_at, _, checksum = struct.unpack_from("<QQI", footer, RECORD.size)
         if summary_at == 0:
             return 0, end, b""
         if not len(MAGIC) <= summary_at <= end:
-            raise ValueError("its index lies outside the file")
+            raise ValueError("the index is outside the file")
         summary = self._read(summary_at, end - summary_at)
         if checksum and crc32(footer[:FOOTER_BYTES - 4], crc32(summary)) != checksum:
-            raise ValueError("the checksum of its index is wrong")
+            raise ValueError("the checksum of the index is wrong")
         return summary_at, end, summary
 
-    def _look_through(self, end: int) -> np.ndarray:
-        """Look at each record of the data section, which reaches to `end` or to its own end before
-        it. Return the messages outside of chunks, (M,) PLACE with ascending times."""
-        places, last = [], len(MAGIC)
-        for kind, at, length in _records(self._read, len(MAGIC), end):
+    def _scan_data_section(self, end: int) -> np.ndarray:
+        """Read the head of each record in the data section, which ends at `end` or before.
+
+        Returns:
+            The messages outside of chunks, (M,) LOCATION with ascending times.
+        """
+        locations, last = [], len(MAGIC)
+        for kind, at, length in _iterate_records(self._read, len(MAGIC), end):
             last = at + length
             if kind == HEADER:
-                self.profile = _string(self._read(at, length), 0)[0].decode(errors="replace")
+                self.profile = _parse_string(self._read(at, length), 0)[0].decode(errors="replace")
             elif kind == MESSAGE:
                 channel, _, time, _ = MESSAGE_HEAD.unpack(self._read(at, MESSAGE_HEAD.size))
-                places.append((_checked(time), channel, at + MESSAGE_HEAD.size,
-                               length - MESSAGE_HEAD.size))
+                locations.append((_check_time(time), channel, at + MESSAGE_HEAD.size,
+                                  length - MESSAGE_HEAD.size))
             elif kind == CHUNK:
-                self.chunks.append(_chunk(self._read(at, HEAD_BYTES), at, length))
+                self.chunks.append(_parse_chunk(self._read(at, HEAD_BYTES), at, length))
             elif kind == MESSAGE_INDEX and self.chunks:
                 channel, size = struct.unpack("<HI", self._read(at, 6))
                 if size:
                     self.chunks[-1].counts[channel] = size // ENTRY_BYTES
             elif kind in (SCHEMA, CHANNEL):
-                self._learn(kind, self._read(at, length))
+                self._add_definition(kind, self._read(at, length))
             elif kind == DATA_END:
                 break
         if last != end:
-            raise ValueError("its data do not end where its index begins")
-        found = np.array(places, PLACE)
+            raise ValueError("the data section does not end where the index begins")
+        found = np.array(locations, LOCATION)
         return found[np.argsort(found["time"], kind="stable")]
 
-    def _take_summary(self, summary: bytes) -> None:
+    def _check_summary(self, summary: bytes) -> None:
         indexed = []
-        for kind, at, length in _records(partial(_part, summary), 0, len(summary)):
+        for kind, at, length in _iterate_records(partial(_slice, summary), 0, len(summary)):
             if kind in (SCHEMA, CHANNEL):
-                self._learn(kind, summary[at:at + length])
+                self._add_definition(kind, summary[at:at + length])
             elif kind == CHUNK_INDEX:
-                indexed.append(_indexed(summary[at:at + length]))
-        if indexed and sorted(indexed) != sorted(chunk.place for chunk in self.chunks):
-            raise ValueError("its index does not fit its data")
+                indexed.append(_parse_chunk_index(summary[at:at + length]))
+        if indexed and sorted(indexed) != sorted(chunk.index_entry for chunk in self.chunks):
+            raise ValueError("the index does not match the data")
 
-    def _learn(self, kind: int, content: bytes) -> None:
-        """Take what a record says of a schema or a channel, the first time that it comes."""
+    def _add_definition(self, kind: int, content: bytes) -> None:
+        """Add the definition of a schema or channel; the first one of an id counts."""
         stream = ReadDataStream(BytesIO(content))
         if kind == SCHEMA:
             schema = Schema.read(stream)
@@ -179,41 +191,41 @@ class McapFile:
             channel = Channel.read(stream)
             self.channels.setdefault(channel.id, channel)
 
-    def _complete(self) -> None:
-        """Unpack the chunks that no message index counts, and from the first on as many as are
-        needed to know all channels with messages."""
+    def _complete_definitions(self) -> None:
+        """Decompress the chunks without message index, and as many of the first chunks as are
+        needed to define all channels that have messages."""
         before = iter(self.chunks)
         for chunk in self.chunks:
             if not chunk.counts:
-                self._look_into(chunk)
-            while not self._knows(chunk.counts):
-                self._look_into(next(before))
-        if not self._knows(np.unique(self.places["channel"]).tolist()):
-            raise ValueError("it does not define a channel that has messages")
+                self._scan_chunk(chunk)
+            while not self._has_definitions(chunk.counts):
+                self._scan_chunk(next(before))
+        if not self._has_definitions(np.unique(self.locations["channel"]).tolist()):
+            raise ValueError("the definition of a channel with messages is missing")
 
-    def _knows(self, ids: Collection[int]) -> bool:
+    def _has_definitions(self, ids: Collection[int]) -> bool:
         known = self.channels
         return all(i in known and known[i].schema_id in (0, *self.schemas) for i in ids)
 
-    def _look_into(self, chunk: Chunk) -> None:
-        data, counts = self._unpacked(chunk), dict[int, int]()
-        for kind, at, length in _records(partial(_part, data), 0, len(data)):
+    def _scan_chunk(self, chunk: Chunk) -> None:
+        data, counts = self._read_chunk(chunk), dict[int, int]()
+        for kind, at, length in _iterate_records(partial(_slice, data), 0, len(data)):
             if kind in (SCHEMA, CHANNEL):
-                self._learn(kind, data[at:at + length])
+                self._add_definition(kind, data[at:at + length])
             elif kind == MESSAGE:
                 channel, = struct.unpack_from("<H", data, at)
                 counts[channel] = counts.get(channel, 0) + 1
         chunk.counts = chunk.counts or counts
 
-    def _unpacked(self, chunk: Chunk) -> bytes:
-        *_, packing, packed, size = chunk.place
+    def _read_chunk(self, chunk: Chunk) -> bytes:
+        *_, packing, packed, size = chunk.index_entry
         data = decompress(self._read(chunk.at, packed), packing.decode(), size)
         if chunk.crc and crc32(data) != chunk.crc:
             raise ValueError("the checksum of a chunk is wrong")
         return data
 
-    def _topics(self) -> list[Topic]:
-        numbers, found = np.unique(self.places["channel"], return_counts=True)
+    def _make_topics(self) -> list[Topic]:
+        numbers, found = np.unique(self.locations["channel"], return_counts=True)
         counts = dict(zip(numbers.tolist(), found.tolist()))
         for chunk in self.chunks:
             for channel, count in chunk.counts.items():
@@ -223,58 +235,63 @@ class McapFile:
                       channel.message_encoding, channel.metadata.get("offered_qos_profiles", ""),
                       counts.get(number, 0)) for number, channel in sorted(self.channels.items())]
 
-    def _times(self) -> tuple[int, int] | None:
+    def _find_times(self) -> tuple[int, int] | None:
         spans = [(chunk.start, chunk.end) for chunk in self.chunks if chunk.counts]
-        if len(self.places):
-            spans.append((int(self.places["time"][0]), int(self.places["time"][-1])))
+        if len(self.locations):
+            spans.append((int(self.locations["time"][0]), int(self.locations["time"][-1])))
         return (min(s for s, _ in spans), max(e for _, e in spans)) if spans else None
 
 
-def _records(read: Callable[[int, int], bytes], at: int, end: int
-             ) -> Iterator[tuple[int, int, int]]:
-    """Yield the kind of each record, where its content begins, and its length. ValueError if the
-    last one reaches past `end`."""
+def _iterate_records(read: Callable[[int, int], bytes], at: int, end: int
+                     ) -> Iterator[tuple[int, int, int]]:
+    """Yield the kind, the offset of the content, and the length of each record.
+
+    Raises ValueError if the last one extends beyond `end`.
+    """
     while at < end:
         kind, length = RECORD.unpack(read(at, RECORD.size))
         at += RECORD.size
         if at + length > end:
-            raise ValueError("a record of it is cut")
+            raise ValueError("the last record is truncated")
         yield kind, at, length
         at += length
 
 
-def _part(data: bytes, at: int, size: int) -> bytes:
+def _slice(data: bytes, at: int, size: int) -> bytes:
     return data[at:at + size]
 
 
-def _chunk(head: bytes, at: int, length: int) -> Chunk:
-    """Read the head of a chunk, of which `length` bytes begin at `at`."""
+def _parse_chunk(head: bytes, at: int, length: int) -> Chunk:
+    """Parse the head of a chunk, whose content has `length` bytes and starts at `at`."""
     start, end, size, crc = struct.unpack_from("<QQQI", head)
-    packing, sizes = _string(head, 28)
-    packed, = struct.unpack_from("<Q", head, sizes)
+    compression, sizes = _parse_string(head, 28)
+    compressed_size, = struct.unpack_from("<Q", head, sizes)
     if size > MAX_BYTES:
         raise ValueError(f"a chunk declares a decompressed size of {size} bytes; at most "
                          f"{MAX_BYTES} are allowed")
-    begin, whole = at - RECORD.size, RECORD.size + length
-    return Chunk((begin, whole, start, end, packing, packed, size), _checked(start), _checked(end),
-                 at + sizes + 8, crc)
+    begin, total = at - RECORD.size, RECORD.size + length
+    return Chunk((begin, total, start, end, compression, compressed_size, size),
+                 _check_time(start), _check_time(end), at + sizes + 8, crc)
 
 
-def _indexed(record: bytes) -> tuple[int, int, int, int, bytes, int, int]:
-    """Return what an index says of a chunk: where it begins, its length, times, compression, and
-    sizes, compressed and not."""
-    start, end, begin, whole, offsets = struct.unpack_from("<QQQQI", record)
-    packing, sizes = _string(record, 36 + offsets + 8)
-    return (begin, whole, start, end, packing, *struct.unpack_from("<QQ", record, sizes))
+def _parse_chunk_index(record: bytes) -> tuple[int, int, int, int, bytes, int, int]:
+    """Parse an index entry of a chunk.
+
+    Returns:
+        Offset, length, start and end time, compression, compressed and uncompressed size.
+    """
+    start, end, begin, total, offsets = struct.unpack_from("<QQQQI", record)
+    compression, sizes = _parse_string(record, 36 + offsets + 8)
+    return (begin, total, start, end, compression, *struct.unpack_from("<QQ", record, sizes))
 
 
-def _checked(time: int) -> int:
+def _check_time(time: int) -> int:
     if time >= END:
-        raise ValueError(f"it has {time} for a time in nanoseconds")
+        raise ValueError(f"{time} is not a valid time in nanoseconds")
     return time
 
 
-def _string(record: bytes, at: int) -> tuple[bytes, int]:
-    """Return a string and where it ends."""
+def _parse_string(record: bytes, at: int) -> tuple[bytes, int]:
+    """Parse a string; return it and the offset of its end."""
     length, = struct.unpack_from("<I", record, at)
     return record[at + 4:at + 4 + length], at + 4 + length

@@ -62,7 +62,7 @@ def apply_measured_height(recording: Recording, clouds: Sequence[LidarFrame]) ->
     The recording itself is returned if it states the height, if its clouds disagree, or if the
     height is about KITTI's.
     """
-    if recording.mounted or recording.reopen is None:
+    if recording.has_sensor_height or recording.reopen is None:
         return recording
     heights = -_find_floors(clouds)[:, 2]
     if not len(heights) or np.ptp(heights) > HEIGHT_TOLERANCE_M:

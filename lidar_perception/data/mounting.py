@@ -1,4 +1,4 @@
-"""How high the sensor of a folder is mounted, for which KITTI's layouts have no place."""
+"""Sensor height of a folder, for KITTI's layouts, which do not store it."""
 
 from __future__ import annotations
 
@@ -10,27 +10,29 @@ from lidar_perception.runs.files import read_text, write_text
 from lidar_perception.runs.folder import MARK, RECORD
 from lidar_perception.types import InputError
 
-MOUNT = "mount.json"  # of what `convert` makes
-SIMULATED = "sensor_digest"  # in what `simulate` writes; other programs have a RECORD, too
+MOUNT = "mount.json"  # written by `convert`
+SIMULATION_KEY = "sensor_digest"  # marks a RECORD of `simulate`; other commands write one, too
 MAX_BYTES = 1 << 16
-DEEPEST = 3      # training/velodyne/0000 can be opened, too
-HIGHEST = 50.0   # metres
+MAX_DEPTH = 3  # of an opened folder below the file: training/velodyne/0000
+MAX_HEIGHT_M = 50.0
 
 
 def write_height(folder: Path, height: float) -> None:
-    """Say in a folder how many metres above the ground its sensor is."""
+    """Store the height of the sensor above the ground, in metres, in a folder."""
     write_text(folder / MOUNT, json.dumps({"height": height}))
 
 
-def height_of(path: Path) -> float | None:
-    """Metres of the sensor above the ground, where `convert` or `simulate` has written the path, or
-    a folder above it, and says so."""
-    for folder in (path, *path.absolute().parents[:DEEPEST]):
+def read_height(path: Path) -> float | None:
+    """Return the height of the sensor above the ground, in metres.
+
+    None unless `convert` or `simulate` stored it in the path or a folder above it.
+    """
+    for folder in (path, *path.absolute().parents[:MAX_DEPTH]):
         for name in (MOUNT, RECORD, MARK):
             with suppress(InputError, ValueError, RecursionError):
-                said = json.loads(read_text(folder / name, MAX_BYTES))
-                if isinstance(said, dict) and (name == MOUNT or SIMULATED in said):
-                    height = said.get("height")
-                    if isinstance(height, (int, float)) and 0 < height <= HIGHEST:
+                content = json.loads(read_text(folder / name, MAX_BYTES))
+                if isinstance(content, dict) and (name == MOUNT or SIMULATION_KEY in content):
+                    height = content.get("height")
+                    if isinstance(height, (int, float)) and 0 < height <= MAX_HEIGHT_M:
                         return float(height)
     return None

@@ -1,5 +1,4 @@
-"""The layout that OpenPCDet's tutorial for custom data sets defines: points/NAME.npy with
-labels/NAME.txt, and ImageSets/*.txt that name frames."""
+"""OpenPCDet's layout for custom data sets: points/NAME.npy, labels/NAME.txt and ImageSets/*.txt."""
 
 from __future__ import annotations
 
@@ -9,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lidar_perception.classes import class_name
-from lidar_perception.data.cloud_files import cloud_scale, load_points
+from lidar_perception.data.cloud_files import load_points, make_cloud_scale_reader
 from lidar_perception.data.frame import BOXES, Frame, Recording
 from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS
 from lidar_perception.runs.files import read_text
@@ -17,23 +16,26 @@ from lidar_perception.types import CLASSES, LARGEST, GroundTruth, InputError
 from lidar_perception.wire.messages import to_class_ids
 from lidar_perception.wire.topics import LIDAR_FRAME
 
-LINE = "x y z dx dy dz heading class"
+LINE_FORMAT = "x y z dx dy dz heading class"
 
 
-def recognises(path: Path) -> bool:
-    """Return True for a folder with points/*.npy beside labels/ or ImageSets/."""
-    return bool(_scans(path)) and any((path / name).is_dir() for name in ("labels", "ImageSets"))
+def is_layout(path: Path) -> bool:
+    """Return True for a folder with points/*.npy and labels/ or ImageSets/."""
+    return bool(_list_scans(path)) and any((path / name).is_dir()
+                                           for name in ("labels", "ImageSets"))
 
 
-def _scans(path: Path) -> list[Path]:
+def _list_scans(path: Path) -> list[Path]:
     return sorted(file for file in path.glob("points/*") if file.suffix.lower() == ".npy")
 
 
-def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """Open the clouds, which may be from anywhere, in order of their names; only the file lists are
-    read. A split file is one of ImageSets/."""
-    files = _scans(path)
-    scale = cloud_scale(files)
+def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
+    """Open the clouds in order of their names; they may be unrelated. Only file lists are read.
+
+    The files in ImageSets/ can be used as split files.
+    """
+    files = _list_scans(path)
+    scale = make_cloud_scale_reader(files)
     frames = []
     for i, file in enumerate(files):
         label, stamp = path / f"labels/{file.stem}.txt", START_NS + i * PERIOD_NS
@@ -46,14 +48,17 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
             if label.stem not in known}
     return Recording(path, "OpenPCDet custom data", frames,
                      frozenset({BOXES} if any(path.glob("labels/*.txt")) else set()),
-                     tuple((name, f"{label} has no points/{name}.npy; copy it there")
+                     tuple((name, f"{label} has no points/{name}.npy; add this file")
                            for name, label in lost.items()) if scans else (),
-                     mounted=False, drives=False)
+                     has_sensor_height=False, is_sequential=False)
 
 
 def read_labels(path: Path) -> GroundTruth | None:
-    """Return the objects of a label file; None without one. A class that is not known by any of its
-    names (Vehicle, person) is Misc, with its name as class_name."""
+    """Read the objects of a label file; None if it does not exist.
+
+    An unknown class becomes Misc, with its name as class_name; synonyms (Vehicle, person) are
+    known.
+    """
     if not path.exists():
         return None
     boxes, names = [], []
@@ -66,8 +71,8 @@ def read_labels(path: Path) -> GroundTruth | None:
             if len(words) < 8 or not ((np.abs(box) <= LARGEST).all() and (box[3:6] > 0).all()):
                 raise ValueError
         except ValueError:
-            raise InputError(f"{path}:{i} is not '{LINE}' with sizes above 0: {line[:200]!r}; "
-                             "correct or remove it") from None
+            raise InputError(f"{path}:{i} is not '{LINE_FORMAT}' with sizes above 0: "
+                             f"{line[:200]!r}; correct or remove it") from None
         boxes.append(box)
         names.append(class_name(" ".join(words[7:])))
     ids = to_class_ids(names)

@@ -1,4 +1,4 @@
-"""PLY files (Turk, 1994): ascii, binary_little_endian and binary_big_endian."""
+"""Reader of PLY files (Turk, 1994): ascii, binary_little_endian and binary_big_endian."""
 
 from __future__ import annotations
 
@@ -6,48 +6,57 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.data.pcd import MAX_CLOUD, MAX_HEADER, points_of_bytes, points_of_text
+from lidar_perception.data.pcd import (
+    MAX_CLOUD_BYTES,
+    MAX_HEADER_BYTES,
+    parse_binary_points,
+    parse_text_points,
+)
 from lidar_perception.runs.files import regular
 from lidar_perception.types import InputError
 
-KINDS = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
-         "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2",
-         "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
-ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+DTYPE_CODES = {
+         "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+               "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2",
+               "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
+BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 LIST = "list"
 
 
 def read_ply(path: Path) -> np.ndarray:
     """Read the vertices of a PLY file.
 
-    Returns: (N,) structured array with their properties, in their types and little-endian.
-    Raises: InputError for another kind of file, for one that was cut, and where a property of the
-    vertices, or of an element before them in a binary file, is a list.
+    Returns:
+        (N,) structured array with their properties, in their types, little-endian.
+
+    Raises:
+        InputError: the file is not a PLY file, truncated, or has a list property in the vertices,
+            or in an element before them in a binary file.
     """
     try:
         content = regular(path).read_bytes()
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; download it again") from None
     try:
-        return _vertices(content)
+        return _parse_vertices(content)
     except (ValueError, TypeError, OverflowError, LookupError) as error:
-        raise InputError(f"{path} is no PLY file that can be read ({error}); save it again as "
-                         "binary PLY") from None
+        raise InputError(f"{path} is not a readable PLY file ({error}); save it again as binary "
+                         "PLY") from None
 
 
-def _vertices(content: bytes) -> np.ndarray:
+def _parse_vertices(content: bytes) -> np.ndarray:
     if not content.startswith(b"ply"):
-        raise ValueError("it does not begin with ply")
+        raise ValueError("it does not start with ply")
     order, text, start = "", False, 0
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
     while True:
-        end = content.find(b"\n", start, MAX_HEADER)
+        end = content.find(b"\n", start, MAX_HEADER_BYTES)
         if end < 0:
-            raise ValueError("it has no line end_header")
+            raise ValueError("the line end_header is missing")
         words = content[start:end].decode("ascii", "replace").split()
         start = end + 1
         if words[:1] == ["format"]:
-            order, text = ORDERS[words[1]], words[1] == "ascii"
+            order, text = BYTE_ORDERS[words[1]], words[1] == "ascii"
         elif words[:1] == ["element"]:
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
@@ -55,20 +64,20 @@ def _vertices(content: bytes) -> np.ndarray:
         elif words[:1] == ["end_header"]:
             break
     if not order:
-        raise ValueError("it has no line format")
+        raise ValueError("the line format is missing")
     data = content[start:]
     for name, number, properties in elements:
         if name != "vertex" and text:
             data = data.split(b"\n", number)[-1]
             continue
         if lists := [what for what, kind in properties if kind == LIST]:
-            raise ValueError(f"{lists[0]} of its {name} elements is a list")
-        layout = np.dtype([(what, order + KINDS[kind]) for what, kind in properties])
-        if not 0 <= number * layout.itemsize <= MAX_CLOUD:
-            raise ValueError(f"it says {number} points")
+            raise ValueError(f"the property {lists[0]} of {name} elements is a list")
+        layout = np.dtype([(what, order + DTYPE_CODES[kind]) for what, kind in properties])
+        if not 0 <= number * layout.itemsize <= MAX_CLOUD_BYTES:
+            raise ValueError(f"it declares {number} points")
         if name == "vertex":
-            read = points_of_text if text else points_of_bytes
-            points = read(data, layout, number)
+            parse = parse_text_points if text else parse_binary_points
+            points = parse(data, layout, number)
             return points.astype(points.dtype.newbyteorder("<"))
         data = data[number * layout.itemsize:]
-    raise ValueError("it has no element vertex")
+    raise ValueError("the element vertex is missing")

@@ -1,4 +1,4 @@
-"""Clouds with all the columns that their driver gave them, whatever they lie in."""
+"""Clouds with all the columns that their driver wrote, from any recording."""
 
 from __future__ import annotations
 
@@ -10,28 +10,33 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data import bag_frames
-from lidar_perception.data.bag import KeptOpen
+from lidar_perception.data.bag import BagHandle
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.cloud_files import to_message
-from lidar_perception.data.cloud_folder import cloud_files, named_times
+from lidar_perception.data.cloud_folder import list_cloud_files, parse_times
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.open import layout_of, open_recording, with_topic
-from lidar_perception.data.to_bag import points_of
+from lidar_perception.data.open import find_layout, open_recording, split_topic
+from lidar_perception.data.to_bag import to_point_array
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.topics import LIDAR_FRAME
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import header_message
 
-APART = 8  # clouds between those of a pair in which a slow robot moves: see spread
+PAIR_DISTANCE = 8  # between the clouds of every second pair, see choose_clouds
 
 
 @dataclass(frozen=True)
 class RawClouds:
-    """Clouds in order of time. layout: what was recognised, for people; stamps_ns: those of all,
-    None where the source has none or invents them; load(i) -> PointCloud2 of cloud i, of rosbags'
-    class; poses: of the frame of a bag's clouds, and topic: theirs. InputError from load names
-    what is broken."""
+    """Clouds in order of time.
+
+    Attributes:
+        layout: description of the recognised layout.
+        stamps_ns: stamps of all clouds; None if they were not recorded.
+        load: load(i) returns cloud i as PointCloud2 of rosbags' class; raises InputError if it is
+            damaged.
+        poses, topic: poses and topic of the clouds of a bag.
+    """
 
     path: Path
     layout: str
@@ -43,53 +48,64 @@ class RawClouds:
 
 
 def open_clouds(path: str | Path, topic: str | None = None) -> RawClouds:
-    """The clouds at a path: a bag (topic: which, needed where several are recorded; see
-    data.open), a file of clouds or a folder of them, or the folder of a data set as data.open
-    knows it. InputError says what is missing, and what can be opened."""
-    path, on = with_topic(path)
+    """Open the clouds at a path: a bag, point cloud files, or a data set (see data.open).
+
+    Args:
+        topic: topic of the clouds of a bag that has several.
+
+    Raises:
+        InputError: the path cannot be opened; the message names what is missing.
+    """
+    path, path_topic = split_topic(path)
     if not path.exists():
-        raise InputError(f"there is no {path}; give a bag, a data set, or files of clouds")
-    if files := cloud_files(path):
-        return _of_files(path, files)
-    if layout_of(path) is bag_frames:
-        return _of_bag(path, topic or on)
+        raise InputError(f"{path} does not exist; give a bag, a data set, or point cloud files")
+    if files := list_cloud_files(path):
+        return _open_files(path, files)
+    if find_layout(path) is bag_frames:
+        return _open_bag(path, topic or path_topic)
     recording = open_recording(path)
     stamps = np.array([frame.stamp_ns for frame in recording])
-    return RawClouds(path, recording.layout, len(recording), stamps if recording.timed else None,
-                     lambda i: _of_frame(recording.frames[i]))
+    return RawClouds(path, recording.layout, len(recording),
+                     stamps if recording.has_times else None,
+                     lambda i: _to_message(recording.frames[i]))
 
 
-def _of_bag(path: Path, topic: str) -> RawClouds:
-    opened = KeptOpen(path)
-    bag = opened.bag()
-    topic = bag_frames.cloud_topic(bag, topic)
+def _open_bag(path: Path, topic: str) -> RawClouds:
+    handle = BagHandle(path)
+    bag = handle.bag()
+    topic = bag_frames.choose_cloud_topic(bag, topic)
     if not bag.counts[topic]:
-        raise InputError(f"{path} has no cloud on {topic}; record it again")
-    frames = bag_frames.BagFrames(opened, topic, bag.topics[topic], bag.counts[topic])
+        raise InputError(f"{path} has no clouds on {topic}; record it again")
+    frames = bag_frames.BagFrames(handle, topic, bag.topics[topic], bag.counts[topic])
     return RawClouds(path, f"{bag.layout}, clouds on {topic}", len(frames), frames.stamps(),
                      frames.message, frames.poses, topic)
 
 
-def _of_files(path: Path, files: list[Path]) -> RawClouds:
-    stamps = named_times(files)
+def _open_files(path: Path, files: list[Path]) -> RawClouds:
+    stamps = parse_times(files)
     return RawClouds(path, f"{len(files)} {files[0].suffix} file{'s' * (len(files) != 1)}",
                      len(files), np.array(stamps) if stamps else None,
                      lambda i: to_message(files[i], stamps[i] if stamps else 0))
 
 
-def _of_frame(frame: Frame) -> Any:
+def _to_message(frame: Frame) -> Any:
     scan = frame.load()
     header = header_message(scan.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
-    return from_array(points_of(scan), header, bag_message)
+    return from_array(to_point_array(scan), header, bag_message)
 
 
-def spread(count: int, wanted: int) -> list[int]:
-    """Which clouds to look at: up to wanted numbers below count in ascending order, pairs evenly
-    over all, so that motion shows within a pair and places differ between them: of a fast robot in
-    those of neighbours, of a slow one in every second, whose clouds are APART."""
+def choose_clouds(count: int, wanted: int) -> list[int]:
+    """Choose up to `wanted` of `count` clouds, in pairs that are spread evenly.
+
+    Motion shows within a pair, and places differ between pairs. A fast robot moves between
+    neighbours; for a slow one, the clouds of every second pair are PAIR_DISTANCE apart.
+
+    Returns:
+        Ascending numbers of the chosen clouds.
+    """
     if count <= wanted or wanted < 2:
         return list(range(min(count, wanted)))
     pairs = wanted // 2
-    gaps = np.where(np.arange(pairs) % 2 == 1, min(APART, count - 1), 1)
+    gaps = np.where(np.arange(pairs) % 2 == 1, min(PAIR_DISTANCE, count - 1), 1)
     starts = np.linspace(0, count - 1 - gaps[-1], pairs).astype(int)
     return sorted({*starts.tolist(), *np.minimum(starts + gaps, count - 1).tolist()})

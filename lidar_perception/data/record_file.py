@@ -1,4 +1,4 @@
-"""A file that grows by whole records, also where the disk is full."""
+"""File that grows by whole records, even if the disk becomes full."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from typing import Any
 
 
 class RecordFile:
-    """A stream for one writer; a context manager. Each write() is a record: one that does not fit
-    leaves no part of itself behind and raises OSError, and so do all after it."""
+    """A stream for one writer; a context manager.
+
+    Each write() is a record. If one does not fit, no part of it remains in the file; it and all
+    later ones raise OSError.
+    """
 
     def __init__(self, path: Path):
         self.file = open(path, "wb", buffering=0)
         self.failure: OSError | None = None
-        self.records = [(-1, 0)]  # (first byte, where it ends) of each
+        self.records = [(-1, 0)]  # (first byte, end offset) of each
 
     def __enter__(self) -> RecordFile:
         return self
@@ -24,7 +27,7 @@ class RecordFile:
         self.file.close()
 
     def tell(self) -> int:
-        """Where the last whole record ends."""
+        """Return the end offset of the last complete record."""
         return self.records[-1][1]
 
     def write(self, record: bytes) -> int:
@@ -36,34 +39,36 @@ class RecordFile:
                 left = left[self.file.write(left):]
         except OSError as error:
             self.failure = error
-            self._cut(self.tell())
+            self._truncate(self.tell())
             raise
         if len(record):
             self.records.append((record[0], self.tell() + len(record)))
         return len(record)
 
     def flush(self) -> None:
-        """Nothing waits here."""
+        """Do nothing: writes are not buffered."""
 
     def sync(self) -> None:
-        """Wait until all is on the disk."""
+        """Wait until everything is on the disk."""
         os.fsync(self.file.fileno())
 
     def close_with(self, end: bytes) -> None:
-        """Write `end` after the last record that leaves room for it; instead of an end of the same
-        kind that is there already."""
+        """Write a final record `end` after the last record that leaves enough space for it.
+
+        An existing final record of the same kind is replaced.
+        """
         kinds = [kind for kind, _ in self.records]
         if end[0] in kinds:
             del self.records[kinds.index(end[0]):]
         while len(self.records) > 1:
             self.failure = None
-            self._cut(self.tell())
+            self._truncate(self.tell())
             with suppress(OSError):
                 self.write(end)
                 self.sync()
                 return
             self.records.pop()
 
-    def _cut(self, size: int) -> None:
+    def _truncate(self, size: int) -> None:
         self.file.truncate(size)
         self.file.seek(size)

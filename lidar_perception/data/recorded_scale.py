@@ -1,4 +1,4 @@
-"""The intensity scale of a recording: one for all its frames, whichever of them is read first."""
+"""Intensity scale of a recording: the same for all its frames, in whatever order they are read."""
 
 from __future__ import annotations
 
@@ -12,28 +12,34 @@ import numpy as np
 from lidar_perception.intensity import StreamScale
 from lidar_perception.types import InputError
 
-SAMPLE = 10  # clouds on which the scale of a recording is decided
-MAX_READ = 100  # clouds of a bag that are read for them
+SAMPLE_SIZE = 10  # clouds from which the scale of a recording is inferred
+MAX_READ = 100  # clouds of a bag that are read to find them
 
 Item = TypeVar("Item")
-Column = tuple[np.ndarray, np.dtype] | None  # see wire.messages.raw_intensity
+Column = tuple[np.ndarray, np.dtype] | None  # see wire.messages.read_raw_intensity
 
 
-def recorded_scale(items: Sequence[Item], read: Callable[[Item], Column]
-                   ) -> Callable[[], float]:
-    """Return a function that gives the full_scale() of a recording, read from SAMPLE of its clouds,
-    spread over all, when it is called first.
+def make_scale_reader(items: Sequence[Item], read: Callable[[Item], Column]
+                      ) -> Callable[[], float]:
+    """Return a function that infers the full_scale() of a recording when it is first called.
 
-    items: files, or other arguments of read; read(item): the intensities as they are written, and
-    their type, or None. Clouds that raise InputError do not count.
+    It reads SAMPLE_SIZE clouds, spread evenly. Clouds that raise InputError are ignored.
+
+    Args:
+        items: files, or other arguments of `read`.
+        read: read(item) returns the intensities as recorded and their dtype, or None.
     """
-    chosen = np.linspace(0, max(len(items) - 1, 0), min(SAMPLE, len(items))).astype(int).tolist()
-    return cache(partial(scale_of, [items[i] for i in chosen], read))
+    count = min(SAMPLE_SIZE, len(items))
+    chosen = np.linspace(0, max(len(items) - 1, 0), count).astype(int).tolist()
+    return cache(partial(infer_scale, [items[i] for i in chosen], read))
 
 
-def scale_of(items: Iterable[Item], read: Callable[[Item], Column]) -> float:
-    """Return the scale of the first SAMPLE clouds, not counting those that are empty or all 0, as
-    drivers publish at their start; 1 without any. Arguments as of recorded_scale."""
+def infer_scale(items: Iterable[Item], read: Callable[[Item], Column]) -> float:
+    """Return the scale of the first SAMPLE_SIZE clouds; 1 without any. Arguments as in
+    make_scale_reader.
+
+    Clouds that are empty or all 0, as drivers publish at their start, are not counted.
+    """
     scale, count = StreamScale(), 0
     for item in items:
         with suppress(InputError):
@@ -41,6 +47,6 @@ def scale_of(items: Iterable[Item], read: Callable[[Item], Column]) -> float:
             if column is not None:
                 scale(*column)
             count += column is None or bool((column[0] > 0).any())
-        if count == SAMPLE:
+        if count == SAMPLE_SIZE:
             break
     return scale.full or 1.0

@@ -1,4 +1,4 @@
-"""Files of records of a fixed size, one behind another: scans, and labels of their points."""
+"""Files of fixed-size records, such as scans and point labels."""
 
 from __future__ import annotations
 
@@ -12,8 +12,18 @@ from lidar_perception.types import InputError
 
 
 def read_records(path: Path, columns: str, dtype: DTypeLike = np.float32) -> np.ndarray:
-    """(N, C) of a file of N records, each a number of this dtype for each of the C columns, which
-    are named for people: "x y z reflectance". InputError where it is missing or cut."""
+    """Read a file of N records with one number per column.
+
+    Args:
+        columns: names of the C columns, such as "x y z reflectance"; for their number, and for
+            error messages.
+
+    Returns:
+        (N, C) array of the given dtype.
+
+    Raises:
+        InputError: the file is missing or truncated.
+    """
     try:
         numbers, size = np.fromfile(regular(path), dtype), path.stat().st_size
     except OSError as error:
@@ -21,5 +31,5 @@ def read_records(path: Path, columns: str, dtype: DTypeLike = np.float32) -> np.
     count = len(columns.split())
     if size % (count * numbers.itemsize):
         raise InputError(f"{path} has {size} bytes, not a multiple of {count * numbers.itemsize} "
-                         f"({columns} as {numbers.dtype}); it was cut, download it again")
+                         f"({columns} as {numbers.dtype}): it is truncated; download it again")
     return numbers.reshape(-1, count)

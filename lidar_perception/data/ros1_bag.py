@@ -1,4 +1,4 @@
-"""ROS 1 bags as if ROS 2 had recorded them: the same topics, with the messages of Jazzy as CDR."""
+"""Reader of ROS 1 bags that converts messages to CDR of Jazzy's types."""
 
 from __future__ import annotations
 
@@ -20,11 +20,14 @@ SUFFIX = ".bag"
 
 
 class Ros1File:
-    """A .bag file open for reading, see StorageFile. Types that Jazzy does not have keep the
-    encoding ros1, as nothing here could read them; what a type has gained since is empty."""
+    """A .bag file open for reading, see StorageFile.
+
+    Topics of types that Jazzy lacks have the encoding "ros1", as they cannot be read. Fields that a
+    type gained since ROS 1 are empty.
+    """
 
     def __init__(self, path: Path):
-        # Not documented as the rest of rosbags is: if it changes, only these bags are affected.
+        # Undocumented in rosbags: if it changes, only ROS 1 bags are affected.
         from rosbags.convert.converter import STATIC_MSGTYPE_RENAMES
         self.reader = AnyReader([path])
         self.reader.open()
@@ -35,30 +38,30 @@ class Ros1File:
             self.topics.append(Topic(
                 c.id, c.topic, kind, "cdr" if kind in load_typestore().fielddefs else "ros1",
                 [LATCHED_QOS] if getattr(c.ext, "latching", 0) else [], c.msgcount))
-        made: dict[str, object] = {}
-        self.converted = {topic.id: self._conversion(self.recorded[topic.id].msgtype, topic.type,
-                                                     made)
-                          for topic in self.topics if topic.encoding == "cdr"}
+        cache: dict[str, object] = {}
+        self.converters = {
+            topic.id: self._make_converter(self.recorded[topic.id].msgtype, topic.type, cache)
+            for topic in self.topics if topic.encoding == "cdr"}
         for topic in self.topics:
             if topic.type in LIVOX:  # rosbags converts point by point
-                self.converted[topic.id] = livox_ros1_to_cdr
+                self.converters[topic.id] = livox_ros1_to_cdr
         self.times = ((self.reader.start_time, self.reader.end_time - 1)
                       if self.reader.message_count else None)
 
     def close(self) -> None:
-        """Close the file."""
         self.reader.close()
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
-        """Yield (topic id, time, CDR bytes) of topics, start <= time < stop, in order of time."""
+        """Yield (topic id, time, CDR bytes) of topics with start <= time < stop, in order of
+        time."""
         connections = [self.recorded[number] for number in ids]
         for connection, time, data in self.reader.messages(connections, start, stop):
-            yield connection.id, time, bytes(self.converted[connection.id](data))
+            yield connection.id, time, bytes(self.converters[connection.id](data))
 
-    def _conversion(self, recorded: str, wanted: str, made: dict[str, object]
-                    ) -> Callable[[Any], Any]:
+    def _make_converter(self, recorded: str, wanted: str, cache: dict[str, object]
+                        ) -> Callable[[Any], Any]:
         from rosbags.convert.converter import is_same_wireformat, migrate_bytes
         if is_same_wireformat(self.reader.typestore, load_typestore(), recorded, wanted):
             return partial(load_typestore().ros1_to_cdr, typename=wanted)
         return partial(migrate_bytes, self.reader.typestore, load_typestore(), recorded, wanted,
-                       made, src_is2=False, dst_is2=True)
+                       cache, src_is2=False, dst_is2=True)

@@ -1,4 +1,4 @@
-"""SemanticKITTI folders: KITTI odometry scans with a class and an instance for every point."""
+"""SemanticKITTI folders: scans of KITTI odometry with a class and an instance for each point."""
 
 from __future__ import annotations
 
@@ -9,57 +9,69 @@ from pathlib import Path
 import numpy as np
 
 from lidar_perception.camera import Calibration
-from lidar_perception.data.frame import POINT_LABELS, POSES, Frame, PointTruth, Recording, nothing
+from lidar_perception.data.frame import (
+    POINT_LABELS,
+    POSES,
+    Frame,
+    PointTruth,
+    Recording,
+    return_none,
+)
 from lidar_perception.data.kitti import odometry
 from lidar_perception.data.kitti.folder import read_velodyne
-from lidar_perception.data.kitti.write import numbers, write_velodyne
+from lidar_perception.data.kitti.write import format_numbers, write_velodyne
 from lidar_perception.data.records import read_records
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import InputError, usable_returns
 
-UNLABELLED = (0, 1)  # unlabelled; outlier, such as a reflection: nobody knows what these points are
+UNLABELLED = (0, 1)  # unlabelled, outlier (such as a reflection)
 # road, parking, sidewalk, other-ground, lane-marking, terrain
 GROUND = (40, 44, 48, 49, 60, 72)
-VEGETATION = 70      # from grass to tree tops, so neither ground nor not ground as a whole
-# Classes with instances. The moving ones (252 to 259) are the same things under another number.
+VEGETATION = 70      # from grass to tree tops: partly ground
+# Classes with instances. The moving ones (252 to 259) have numbers of their own.
 THINGS = {10: "car", 11: "bicycle", 13: "bus", 15: "motorcycle", 16: "on-rails", 18: "truck",
           20: "other-vehicle", 30: "person", 31: "bicyclist", 32: "motorcyclist"}
 MOVING = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20}
 
 
-def recognises(path: Path) -> bool:
-    """Return True for a folder of KITTI odometry, see odometry.recognises, with labels."""
-    return odometry.recognises(path) and any(
-        (sequence / "labels").is_dir() for sequence in odometry.sequences_of(path))
+def is_layout(path: Path) -> bool:
+    """Return True for a folder of KITTI odometry (see odometry.is_layout) with labels."""
+    return odometry.is_layout(path) and any(
+        (sequence / "labels").is_dir() for sequence in odometry.list_sequences(path))
 
 
-def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """Open the labelled scans, in order; only the file lists and the times are read. Sequences
-    without a labels folder, as the test ones, are left out."""
-    sequences = [sequence for sequence in odometry.sequences_of(path)
+def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
+    """Open the labelled scans in order; only the file lists and the times are read.
+
+    Sequences without a labels folder, such as the test sequences, are left out.
+    """
+    sequences = [sequence for sequence in odometry.list_sequences(path)
                  if (sequence / "labels").is_dir() and any(sequence.glob("velodyne/*.bin"))]
     if not sequences:
         raise InputError(f"{path} has labels but no SemanticKITTI scans: expected "
-                         "sequences/00/velodyne/*.bin beside sequences/00/labels/*.label")
-    frames, timed = odometry.frames_of(sequences)
-    posed = any(map(odometry.pose_file, sequences))
-    return Recording(path, "SemanticKITTI", [_labelled(frame) for frame in frames],
-                     frozenset({POINT_LABELS} | ({POSES} if posed else set())), timed=timed)
+                         "sequences/00/velodyne/*.bin and sequences/00/labels/*.label")
+    frames, timed = odometry.make_frames(sequences)
+    posed = any(map(odometry.find_pose_file, sequences))
+    return Recording(path, "SemanticKITTI", [_add_point_truth(frame) for frame in frames],
+                     frozenset({POINT_LABELS} | ({POSES} if posed else set())), has_times=timed)
 
 
-def _labelled(frame: Frame) -> Frame:
-    """The frame with the labels of its points, which are scored all around: without its camera."""
+def _add_point_truth(frame: Frame) -> Frame:
+    """Return the frame with its point labels, and without its camera, as all points are scored."""
     scan = frame.points
     assert scan is not None
     label = scan.parents[1] / f"labels/{scan.stem}.label"
-    return replace(frame, point_truth=partial(_point_truth, scan, label), calibration=nothing,
-                   image=None)
+    return replace(frame, point_truth=partial(_read_point_truth, scan, label),
+                   calibration=return_none, image=None)
 
 
-def _point_truth(scan: Path, path: Path) -> PointTruth:
-    """Labels of the usable points. InputError where a file is missing, cut or of another scan."""
+def _read_point_truth(scan: Path, path: Path) -> PointTruth:
+    """Return the labels of the usable points.
+
+    Raises InputError if a file is missing or truncated, or if their sizes differ.
+    """
     cloud = read_velodyne(scan)
-    labels = read_records(path, "label", np.uint32)[:, 0]  # class below, instance in the upper half
+    labels = read_records(path, "label", np.uint32)[:, 0]  # upper 16 bits: instance; lower: class
     if len(labels) != len(cloud):
         raise InputError(f"{path} has {len(labels)} labels for the {len(cloud)} points of {scan}; "
                          "download both again")
@@ -69,23 +81,31 @@ def _point_truth(scan: Path, path: Path) -> PointTruth:
 
 def write_scan(folder: Path, number: int, cloud: np.ndarray, semantic: np.ndarray,
                instance: np.ndarray) -> None:
-    """velodyne and labels of one scan of a sequence's folder: cloud (N, 4), semantic and instance
-    (N,) below 65536."""
+    """Write scan and labels to a sequence folder.
+
+    Args:
+        cloud: (N, 4) [x y z reflectance].
+        semantic, instance: (N,) class and instance of each point, below 65536.
+    """
     labels = np.asarray(instance, np.uint32) << 16 | np.asarray(semantic, np.uint32)
     write_velodyne(folder / f"velodyne/{number:06}.bin", cloud)
     write_bytes(folder / f"labels/{number:06}.label", labels.tobytes())
 
 
-def pose_line(pose: np.ndarray, calibration: Calibration) -> str:
-    """The line of poses.txt of a scan; pose (4, 4) is the LiDAR's frame in that of the first scan
-    of the sequence, the file has the camera's."""
+def format_pose(pose: np.ndarray, calibration: Calibration) -> str:
+    """Return the line of poses.txt for a scan.
+
+    Args:
+        pose: (4, 4) of the LiDAR in the frame of the first scan; the file has that of the camera.
+    """
     to_camera = calibration.lidar_to_camera
-    moved = to_camera @ pose @ np.linalg.inv(to_camera)
-    return numbers(moved[:3] + 0.0) + "\n"  # no -0
+    camera_pose = to_camera @ pose @ np.linalg.inv(to_camera)
+    return format_numbers(camera_pose[:3] + 0.0) + "\n"  # + 0.0 turns -0 into 0
 
 
-def calibration_text(calibration: Calibration) -> str:
-    """calib.txt: the projections of the four cameras, all the same one, and the LiDAR's pose."""
+def format_calibration(calibration: Calibration) -> str:
+    """Return the text of calib.txt: the projections of four identical cameras and the LiDAR's
+    pose."""
     rows = {**{f"P{i}": calibration.intrinsics for i in range(4)},
             "Tr": calibration.lidar_to_camera[:3]}
-    return "".join(f"{name}: {numbers(matrix)}\n" for name, matrix in rows.items())
+    return "".join(f"{name}: {format_numbers(matrix)}\n" for name, matrix in rows.items())

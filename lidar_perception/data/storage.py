@@ -1,7 +1,7 @@
 """Interface of the storage files of bags: MCAP, SQLite and ROS 1.
 
-rosbags' reader of ROS 2 bags is not used: it trusts metadata.yaml and finds messages by the text of
-their QoS (rosbags/rosbag2/reader.py), and refuses MCAP files that it does not expect
+rosbags' reader of ROS 2 bags is not used: it trusts metadata.yaml, finds messages by the text of
+their QoS (rosbags/rosbag2/reader.py), and rejects unusual MCAP files
 (rosbags/rosbag2/storage_mcap.py).
 """
 
@@ -11,17 +11,20 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from heapq import heappop, heappush, heapreplace
 from typing import Any, NamedTuple, Protocol
 
-START, END = -2**63, 2**63 - 1  # before and after all times in nanoseconds
-Message = tuple[Any, int, bytes]  # its topic, time of recording in nanoseconds, data
+START, END = -2**63, 2**63 - 1  # before and after all times in ns
+Message = tuple[Any, int, bytes]  # topic id, log time in ns, data
 Stream = Iterator[Message]  # in order of time
 
 
 class Topic(NamedTuple):
-    """A topic of one file; a file may have several of one name.
+    """A topic of one file; a file may have several of the same name.
 
-    id: of its messages. type: "pkg/msg/Name", or "" where the file does not say it. encoding: "cdr"
-    where its messages can be read. qos: the offered profiles, as YAML text or parsed.
-    messages: number of its messages.
+    Attributes:
+        id: topic id of its messages.
+        type: "pkg/msg/Name", or "" if the file does not state it.
+        encoding: "cdr" if its messages can be read.
+        qos: offered profiles, as YAML text or parsed.
+        messages: number of messages.
     """
 
     id: int
@@ -33,32 +36,41 @@ class Topic(NamedTuple):
 
 
 class StorageFile(Protocol):
-    """A file open for reading. times: of the first and the last message in nanoseconds, None
-    without messages. Everything is taken from the file itself, never from metadata.yaml."""
+    """A storage file open for reading. Its content never depends on metadata.yaml.
+
+    Attributes:
+        times: of the first and last message in ns; None without messages.
+    """
 
     topics: list[Topic]
     times: tuple[int, int] | None
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
-        """Yield the messages of topics, start <= time < stop, in order of time."""
+        """Yield the messages of topics with start <= time < stop, in order of time."""
 
     def close(self) -> None:
         """Close the file."""
 
 
-def in_time_order(sources: Iterable[tuple[int, Callable[[], Stream]]]) -> Stream:
-    """Merge streams, each given with the time from which on it has messages. A stream is opened
-    when that time has come, and closed by its end: few are open at a time."""
+def merge_streams(sources: Iterable[tuple[int, Callable[[], Stream]]]) -> Stream:
+    """Merge streams in order of time.
+
+    A stream is opened when its start time is reached, and closed at its end, so few are open at a
+    time.
+
+    Args:
+        sources: start time of each stream, and the function that opens it.
+    """
     open_streams: list[tuple[int, int, Message, Stream]] = []
     for number, (start, begin) in enumerate([*sorted(sources, key=lambda source: source[0]),
                                              (END, lambda: iter(()))]):
         while open_streams and open_streams[0][0] < start:
             _, which, message, stream = open_streams[0]
             yield message
-            if (following := next(stream, None)) is None:
+            if (next_message := next(stream, None)) is None:
                 heappop(open_streams)
             else:
-                heapreplace(open_streams, (following[1], which, following, stream))
+                heapreplace(open_streams, (next_message[1], which, next_message, stream))
         stream = begin()
         if (first := next(stream, None)) is not None:
             heappush(open_streams, (first[1], number, first, stream))

@@ -1,4 +1,4 @@
-"""Labelled frames to one rosbag2 bag, as the nodes and the evaluation expect it."""
+"""Writing of labelled frames to a rosbag2 bag, on the topics that nodes and evaluation expect."""
 
 from __future__ import annotations
 
@@ -41,21 +41,28 @@ from msg_utils.stamps import header_message
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 DETECTIONS_3D = "vision_msgs/msg/Detection3DArray"
-POINT_LABELS = np.dtype([(SEMANTIC, "<u2"), (INSTANCE, "<u2")])  # as data.frame.PointTruth
+POINT_LABELS = np.dtype([(SEMANTIC, "<u2"), (INSTANCE, "<u2")])  # see data.frame.PointTruth
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 
 
 def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False,
               force: bool = False, skipped: list[str] | None = None, clouds: bool = True,
               detections_3d: bool = False) -> int:
-    """Write frames in order; returns how many. The calibration is written, latched, whenever it
-    changes, before the scan it belongs to: as CameraInfo, as TransformStamped and as TF; poses,
-    where there are any, as the sensor's odometry; labels of points as columns of their cloud.
-    images: the camera's PNG files too, where they are. Without clouds, all else. detections_3d: the
-    labelled boxes as Detection3DArray too.
+    """Write frames to a bag in order, and return their number.
 
-    A frame that cannot be read is left out, and the reason put into skipped; InputError without
-    such a list, and where the bag cannot be written.
+    The calibration is written, latched, before the first scan and whenever it changes: as
+    CameraInfo, TransformStamped and TF. Poses are written as odometry of the sensor, and point
+    labels as columns of their cloud.
+
+    Args:
+        images: write the camera's PNG files, too.
+        skipped: list that receives the errors of frames that cannot be read; without it, the first
+            one is raised.
+        clouds: False to write everything except clouds.
+        detections_3d: write the labelled boxes as Detection3DArray, too.
+
+    Raises:
+        InputError: the bag cannot be written, or a frame cannot be read.
     """
     with BagWriter(path, force=force) as bag:
         writer = FrameWriter(bag, images=images, clouds=clouds, detections_3d=detections_3d)
@@ -73,8 +80,8 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
     return count
 
 
-class Content(NamedTuple):
-    """The parts of a frame that go into a bag; None for those that it does not have."""
+class FrameContent(NamedTuple):
+    """Content of a frame for a bag; None for missing parts."""
 
     header: Any
     stamp_ns: int
@@ -86,14 +93,14 @@ class Content(NamedTuple):
 
 
 class FrameWriter:
-    """Write frames into an open bag, see write_bag."""
+    """Writer of frames to an open bag, see write_bag."""
 
     def __init__(self, bag: BagWriter, *, images: bool = False, clouds: bool = True,
                  detections_3d: bool = False) -> None:
         self.bag, self.images, self.clouds, self.detections_3d = bag, images, clouds, detections_3d
         self._shown: frozenset[tuple[str, int]] = frozenset()
-        self._labelled: set[int] = set()  # stamps, by which labels and clouds find each other
-        self._calibration: Calibration | None = None  # the last one that was written
+        self._labelled: set[int] = set()  # stamps, by which labels are assigned to clouds
+        self._calibration: Calibration | None = None  # the last one written
         bag.add_topic(CAMERA_INFO, "sensor_msgs/msg/CameraInfo", LATCHED_QOS)
         bag.add_topic(EXTRINSICS, "geometry_msgs/msg/TransformStamped", LATCHED_QOS)
         bag.add_topic(TF_STATIC, "tf2_msgs/msg/TFMessage", LATCHED_QOS)
@@ -103,24 +110,24 @@ class FrameWriter:
         if clouds:
             bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
 
-    def read(self, frame: Frame) -> Content:
-        """Read the content of a frame. InputError for one that cannot be read, or that no bag can
-        hold."""
+    def read(self, frame: Frame) -> FrameContent:
+        """Read the content of a frame. Raises InputError if it cannot be read or stored in a
+        bag."""
         scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
         pose, columns = frame.pose(), frame.point_truth() if self.clouds else None
         if frame.stamp_ns < 0:
-            raise InputError(f"{frame.name}: a stamp before 1970, which no bag holds; set the "
-                             "clock of the sensor")
+            raise InputError(f"{frame.name}: its stamp is before 1970, which a bag cannot store; "
+                             "set the clock of the sensor")
         if truth is not None and frame.stamp_ns in self._labelled:
-            raise InputError(f"{frame.name}: another labelled scan has its stamp, so that nothing "
-                             "would say whose the labels are")
+            raise InputError(f"{frame.name}: another labelled scan has the same stamp, so labels "
+                             "could not be assigned to scans")
         header = header_message(frame.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
         image = frame.image if self.images and frame.image and frame.image.exists() else None
-        return Content(header, frame.stamp_ns, calibration, pose, truth, image,
-                       points_of(scan, columns) if self.clouds else None)
+        return FrameContent(header, frame.stamp_ns, calibration, pose, truth, image,
+                            to_point_array(scan, columns) if self.clouds else None)
 
-    def write(self, content: Content) -> None:
-        """Write the content of a frame. InputError where the bag cannot be written."""
+    def write(self, content: FrameContent) -> None:
+        """Write the content of a frame. Raises InputError if the bag cannot be written."""
         bag, (header, stamp_ns, calibration, pose, truth, image, points) = self.bag, content
         if calibration is not None and not calibration.equals(self._calibration):
             self._calibration = calibration
@@ -133,15 +140,16 @@ class FrameWriter:
             self._shown = marker_keys(markers)
             bag.write(TRUTH, stamp_ns, markers)
             if self.detections_3d:
-                bag.write(TRUTH_3D, stamp_ns, _detections(markers, header))
+                bag.write(TRUTH_3D, stamp_ns, _make_detections(markers, header))
         if image is not None:
             _write_image(bag, image, stamp_ns)
         if points is not None:
             bag.write(POINTS, stamp_ns, from_array(points, header, bag_message))
 
 
-def points_of(scan: LidarFrame, labels: PointTruth | None = None) -> np.ndarray:
-    """(N,) of POINT, without an intensity only x y z; and of POINT_LABELS, where there are any."""
+def to_point_array(scan: LidarFrame, labels: PointTruth | None = None) -> np.ndarray:
+    """Return points as structured array (N,): POINT (without intensity if the scan has none), plus
+    POINT_LABELS if labels are given."""
     fields = POINT.descr[:4 if scan.intensity is not None else 3]
     points = np.empty(len(scan), fields + (POINT_LABELS.descr if labels else []))
     for i, axis in enumerate("xyz"):
@@ -153,8 +161,8 @@ def points_of(scan: LidarFrame, labels: PointTruth | None = None) -> np.ndarray:
     return points
 
 
-def _detections(markers: Any, header: Any) -> Any:
-    """Detection3DArray of the labels as markers have them; the id is that of the track, if any."""
+def _make_detections(markers: Any, header: Any) -> Any:
+    """Return the Detection3DArray of label markers; ids are those of the tracks, if unique."""
     objects = from_marker_array(markers)
     tracks = [track for extra in objects.extras if (track := extra.get("track_id")) is not None]
     numbered = len(set(tracks)) == len(objects)

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from lidar_perception.data.bag import BagWriter
-from lidar_perception.data.frame import nothing
+from lidar_perception.data.frame import return_none
 from lidar_perception.data.to_bag import DETECTIONS_3D, MARKERS, FrameWriter
 from lidar_perception.detecting.formats import Run
 from lidar_perception.detecting.results import FrameResult
@@ -56,7 +56,7 @@ class Bag:
             content = self.writer.read(frame)
         except InputError:
             try:  # without labels that no bag can hold
-                content = self.writer.read(replace(frame, truth=nothing))
+                content = self.writer.read(replace(frame, truth=return_none))
             except InputError as error:
                 self.run.skipped.append(f"not in {self.path}: {error}")
                 return

@@ -19,7 +19,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Recording
 from lidar_perception.data.kitti.results import (
     FOLDER,
-    result_calibration,
+    choose_calibration,
     write_results,
     write_tracking_results,
 )
@@ -112,7 +112,7 @@ class Kitti(WrittenAtEnd):
     def add(self, result: FrameResult) -> None:
         """Write the file of a frame, or keep its tracks for that of their drive."""
         frame = result.frame
-        calibration, nominal = result_calibration(frame)
+        calibration, nominal = choose_calibration(frame)
         if nominal:
             self.run.say("there is no camera calibration: kitti/ is in the frame of a nominal "
                          "camera, level and 0.27 m ahead of the LiDAR")

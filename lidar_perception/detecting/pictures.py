@@ -60,7 +60,7 @@ class FrameDrawer:
 
     def time(self, stamp_ns: int) -> str:
         """Write a stamp as a date, or without one as seconds since the first frame."""
-        if self.run.recording.timed and stamp_ns >= FIRST_DATE_NS:
+        if self.run.recording.has_times and stamp_ns >= FIRST_DATE_NS:
             date = datetime.fromtimestamp(stamp_ns // 10**9, UTC)
             return f"{date:%Y-%m-%d %H:%M:%S}.{stamp_ns // 10**6 % 1000:03} UTC"
         return f"{(stamp_ns - self._first_ns) / 1e9:.1f} s"

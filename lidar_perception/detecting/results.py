@@ -100,7 +100,7 @@ def with_optional_parts(frame: Frame, say: Callable[[str], None]) -> Frame:
                 say(f"{what} left out: {error}")
                 return None
         return cache(read_or_none)
-    return replace(frame.loaded_once(), truth=or_none(frame.truth, "labels"),
+    return replace(frame.with_cached_scan(), truth=or_none(frame.truth, "labels"),
                    calibration=or_none(frame.calibration, "camera calibration"),
                    pose=or_none(frame.pose, "pose"))
 

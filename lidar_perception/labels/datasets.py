@@ -1,4 +1,4 @@
-"""A recording as the folder of a data set, that other tools and open_recording read: the way back
+"""A recording as the folder of a data set, that other tools and open_layout read: the way back
 from a bag.
 
 What a layout has no place for is left out, and said.
@@ -16,7 +16,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data import semantickitti
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.folder import GAP_NS, PERIOD_NS
-from lidar_perception.data.kitti.write import calibration_text, write_object_text, write_velodyne
+from lidar_perception.data.kitti.write import format_calibration, write_object_text, write_velodyne
 from lidar_perception.data.mounting import write_height
 from lidar_perception.labels.datasets_nuscenes import NuscenesTables
 from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels, FrameLabels, of_truth
@@ -148,7 +148,7 @@ def _kitti_tracking(folder: Path, frames: Iterator[Placed], summary: Summary) ->
         name = f"{placed.drive:04}"
         write_velodyne(root / f"velodyne/{name}/{placed.index:06}.bin", _cloud(frame, summary))
         if name not in texts:
-            write_bytes(root / f"calib/{name}.txt", calibration_text(calibration).encode())
+            write_bytes(root / f"calib/{name}.txt", format_calibration(calibration).encode())
         texts.setdefault(name, []).append(kitti_tracking.text_of_frame(
             placed.labels, frame, placed.index))
         _remark_losses(summary, placed, "boxes, track ids")
@@ -176,11 +176,11 @@ def _semantickitti(folder: Path, frames: Iterator[Placed], summary: Summary) -> 
         (start, calibration, _), root = rows[0], folder / f"sequences/{drive:02}"
         times = "".join(f"{(stamp - start) / 1e9:.6e}\n" for stamp, _, _ in rows)
         poses = [pose for _, _, pose in rows if pose is not None]
-        write_bytes(root / "calib.txt", semantickitti.calibration_text(calibration).encode())
+        write_bytes(root / "calib.txt", semantickitti.format_calibration(calibration).encode())
         write_bytes(root / "times.txt", times.encode())
         if len(poses) == len(rows):
             to_first = np.linalg.inv(poses[0])
-            write_bytes(root / "poses.txt", "".join(semantickitti.pose_line(
+            write_bytes(root / "poses.txt", "".join(semantickitti.format_pose(
                 to_first @ pose, calibration) for pose in poses).encode())
         elif poses:
             summary.remark("left out: poses, as not every frame of the drive has one")

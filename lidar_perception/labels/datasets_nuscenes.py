@@ -23,11 +23,11 @@ from lidar_perception.data.nuscenes.boxes import (
     CATEGORIES,
     NAMES,
     WITH_RIDER,
-    in_global,
-    quaternions,
+    to_global_boxes,
+    to_quaternions,
 )
 from lidar_perception.data.nuscenes.folder import CHANNEL, FULL_REFLECTION
-from lidar_perception.data.nuscenes.results import places
+from lidar_perception.data.nuscenes.results import format_boxes
 from lidar_perception.geometry import points_in_boxes
 from lidar_perception.labels.drive_labels import NO_TRACK, FrameLabels
 from lidar_perception.labels.formats.nuscenes import OURS, RIDDEN, WRITTEN, rotation_read
@@ -104,7 +104,7 @@ class NuscenesTables:
     def _boxes(self, scene: str, sample: str, labels: FrameLabels, pose: np.ndarray,
                cloud: np.ndarray) -> None:
         inside = np.diff(points_in_boxes(cloud, labels.boxes)[1]) if len(labels) else ()
-        placed = places(sample, *in_global(labels.boxes, pose))
+        placed = format_boxes(sample, *to_global_boxes(labels.boxes, pose))
         for k, place in enumerate(placed):
             track, name, extra = labels.track_ids[k], labels.class_names[k], labels.extra[k]
             lidar, radar = int(inside[k]), 0
@@ -156,7 +156,7 @@ class NuscenesTables:
 
 
 def _quaternion(turn: np.ndarray) -> list[float]:
-    return quaternions(turn[None])[0].tolist()
+    return to_quaternions(turn[None])[0].tolist()
 
 
 def _png() -> bytes:

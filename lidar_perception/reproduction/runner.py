@@ -42,7 +42,7 @@ def run(experiment: Experiment, recording: Recording, out: Path, *, jobs: int = 
                  jobs=jobs, dask=dask, title=experiment.name)
         done.sort(names)
         records = [json.loads(done.lines[name]) for name in names[:limit]]
-    lost = recording.lost if limit is None else ()
+    lost = recording.missing_scans if limit is None else ()
     return records + [{"frame": name, "skipped": reason} for name, reason in lost]
 
 

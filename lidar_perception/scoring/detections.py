@@ -12,9 +12,9 @@ from typing import Generic, TypeVar
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.kitti.results import (
+    choose_calibration,
+    find_result_folder,
     read_results,
-    result_calibration,
-    result_files,
     write_results,
 )
 from lidar_perception.detectors.contract import Detector
@@ -75,7 +75,7 @@ def _by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None
         if folder is not None:
             try:
                 write_results(folder / f"{frame.name}.txt", result.detections,
-                              result_calibration(frame)[0])
+                              choose_calibration(frame)[0])
             except InputError as error:  # of the disk, or numbers that are not finite
                 raise RunError(str(error)) from None
         return result
@@ -87,7 +87,7 @@ def by_files(folder: Path, recording: Recording
     """Read KITTI result files, folder/NAME.txt, of every frame with labels. folder may be that of a
     run of `detect`; frames that the run skipped are skipped. With a folder a Start of
     scoring.run."""
-    files = result_files(folder)
+    files = find_result_folder(folder)
     skipped = journal.skipped_frames(files.parent)
 
     def measure(frame: Frame) -> Detected[GroundTruth] | None:
@@ -98,7 +98,7 @@ def by_files(folder: Path, recording: Recording
             raise InputError(skipped[frame.name])
         try:
             found = read_results(files / f"{frame.name}.txt",
-                                 result_calibration(frame)[0].lidar_to_camera)
+                                 choose_calibration(frame)[0].lidar_to_camera)
         except InputError as error:
             raise RunError(str(error)) from None
         return Detected(frame.name, truth, found, calibration)

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lidar_perception.data.bag import Bag, KeptOpen
+from lidar_perception.data.bag import Bag, BagHandle
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.wire.topics import TRUTH
 from msg_utils.markers import MarkedObjects, from_marker_array
@@ -25,11 +25,11 @@ def answered(path: Path, *topics: str) -> list[list[Answered]]:
     """For each of these topics of a bag, the labelled frames that have an answer on it, in order of
     time; of equal stamps the last. Answers are in the frame of the labels; InputError where nothing
     connects theirs with it."""
-    opened = KeptOpen(path)
+    opened = BagHandle(path)
     found = by_stamp(opened.bag(), (*topics, TRUTH))
     truth = found[TRUTH]
     poses = BagPoses(opened, next((each.frame_id for each in truth.values()), ""))
-    return [[Answered(stamp, truth[stamp], poses.brought(found[topic][stamp], topic))
+    return [[Answered(stamp, truth[stamp], poses.to_cloud_frame(found[topic][stamp], topic))
              for stamp in sorted(found[topic].keys() & truth.keys())] for topic in topics]
 
 

@@ -65,7 +65,7 @@ def fill(report: Report, recording: Recording, start: Start, *, limit: int | Non
             elif result is not None:
                 report.update(result)
     if limit is None:
-        report.skipped.extend(reason for _, reason in recording.lost)
+        report.skipped.extend(reason for _, reason in recording.missing_scans)
 
 
 def complete(journal: Journal, recording: Recording, start: Start, names: Sequence[str], *,

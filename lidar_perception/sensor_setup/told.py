@@ -58,7 +58,7 @@ def told_by(poses: BagPoses | None, numbers: Sequence[int], stamps_ns: np.ndarra
     if poses is None or stamps_ns is None or not (poses.base or poses.odometry):
         return NOTHING
     base = poses.base
-    mount = poses.mounted(base) if base else None
+    mount = poses.find_mount(base) if base else None
     moved = {}
     # Odometry that does not say what it is of does not say where the base went.
     nameless = poses.odometry and not poses.carrier
@@ -66,10 +66,10 @@ def told_by(poses: BagPoses | None, numbers: Sequence[int], stamps_ns: np.ndarra
         pose = _base_pose(poses, int(stamps_ns[number]), mount if base else np.eye(4))
         if pose is not None:
             moved[number] = pose
-    unposed = "" if 2 * len(moved) >= len(numbers) or not poses.known else (
+    unposed = "" if 2 * len(moved) >= len(numbers) or not poses.available else (
         "its odometry does not say in child_frame_id what it is of" if nameless else
         f"{len(numbers) - len(moved)} of {len(numbers)} clouds have no pose at their time")
-    return Told(base, mount, poses.mounted(FOOTPRINT), moved, poses.left_out, unposed)
+    return Told(base, mount, poses.find_mount(FOOTPRINT), moved, poses.invalid_count, unposed)
 
 
 def _base_pose(poses: BagPoses, stamp_ns: int, mount: np.ndarray | None) -> np.ndarray | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidar_perception.camera import FORWARD_CAMERA, Calibration
 from lidar_perception.data.kitti.labels import DONT_CARE
-from lidar_perception.data.kitti.write import seen_by_camera
+from lidar_perception.data.kitti.write import keep_visible_objects
 from lidar_perception.types import GroundTruth
 
 # People who label leave out what they can hardly see. The least of the 20 pedestrians of the real
@@ -44,7 +44,7 @@ def labels_around(truth: GroundTruth) -> GroundTruth:
 def kitti_labels(truth: GroundTruth, camera: Calibration = FORWARD_CAMERA) -> GroundTruth:
     """What a KITTI label file has: the labelled objects of which a part is in the image, and as
     notes the regions of the others, DontCare."""
-    in_image = seen_by_camera(truth, camera)
+    in_image = keep_visible_objects(truth, camera)
     labelled = worth_a_label(in_image)
     notes = [("DontCare", {**DONT_CARE, "bbox": extra["bbox"]})
              for extra, known in zip(in_image.extras, labelled) if not known]

@@ -72,9 +72,10 @@ def write_frame(folder: Path, plan: Plan, number: int) -> None:
             name = f"{sequence:04}"
             write_kitti.write_velodyne(folder / f"training/velodyne/{name}/{moment:06}.bin", cloud)
             shares = {f"training/label_02/{name}.txt":
-                      write_kitti.tracking_label_text(moment, truth, FORWARD_CAMERA)}
+                      write_kitti.format_tracking_labels(moment, truth, FORWARD_CAMERA)}
             if moment == 0:
-                shares[f"training/calib/{name}.txt"] = write_kitti.calibration_text(FORWARD_CAMERA)
+                calibration = write_kitti.format_calibration(FORWARD_CAMERA)
+                shares[f"training/calib/{name}.txt"] = calibration
     finish_frame(folder, number, shares)
 
 
@@ -84,10 +85,10 @@ def _semantic(folder: Path, plan: Plan, sequence: int, moment: int, scan: Simula
     name = f"sequences/{sequence:0{digits}}"
     semantickitti.write_scan(folder / name, moment, cloud, scan.semantic[order],
                                    scan.instance[order])
-    shares = {f"{name}/poses.txt": semantickitti.pose_line(scan.pose, FORWARD_CAMERA),
+    shares = {f"{name}/poses.txt": semantickitti.format_pose(scan.pose, FORWARD_CAMERA),
               f"{name}/times.txt": f"{moment / plan.sensor.rate:.6e}\n"}
     if moment == 0:
-        shares[f"{name}/calib.txt"] = semantickitti.calibration_text(FORWARD_CAMERA)
+        shares[f"{name}/calib.txt"] = semantickitti.format_calibration(FORWARD_CAMERA)
     return shares
 
 

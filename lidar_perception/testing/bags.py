@@ -72,7 +72,7 @@ def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = 
         copies = {topic: bag.add_connection(
             names.get(topic, topic), kind, typestore=load_typestore(),
             offered_qos_profiles=recorded.qos(topic)) for topic, kind in recorded.topics.items()}
-        for topic, stamp, data in recorded.raw():
+        for topic, stamp, data in recorded.raw_messages():
             bag.write(copies[topic], stamp, data)
     return path
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import islice
 
-from lidar_perception.data.drives import goes_on
+from lidar_perception.data.drives import is_same_drive
 from lidar_perception.data.frame import POSES, Frame, Recording
 from lidar_perception.tracking.ego import (
     NO_SOURCE,
@@ -45,7 +45,8 @@ class DriveTracker:
         """The tracks of the frame after these detections, in its LiDAR frame. InputError where its
         pose cannot be read."""
         sequence, stamp_ns = self._last
-        if frame.sequence != sequence or not (frame.sequence or goes_on(stamp_ns, frame.stamp_ns)):
+        if frame.sequence != sequence or not (
+                frame.sequence or is_same_drive(stamp_ns, frame.stamp_ns)):
             self.tracker.reset()
             self.pose_of = recorded_poses(self.ego)
             self._number += 1

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from lidar_perception.data.drives import drives_of
+from lidar_perception.data.drives import split_drives
 from lidar_perception.data.frame import BOXES, Frame, Recording
 from lidar_perception.data.mount_check import apply_measured_height, load_first_clouds
 from lidar_perception.data.open import open_recording
@@ -65,7 +65,7 @@ class LabelledFrames:
         """
         if self.drives:
             labelled = [frame for frame in self.frames if _may_have_labels(frame)] or self.frames
-            runs = [[labelled[i] for i in run] for several in drives_of(labelled).values()
+            runs = [[labelled[i] for i in run] for several in split_drives(labelled).values()
                     for run in several]
             names = {frame.name for frame in draw_drives(runs, share, seed)}
         else:
@@ -93,12 +93,12 @@ def open_labelled_frames(path: Path, split: Path | None = None, height: float = 
     """
     recording = open_recording(path, split=split)
     recording.require(BOXES, "train")
-    return LabelledFrames(path, tuple(recording.frames[:]), recording.drives,
+    return LabelledFrames(path, tuple(recording.frames[:]), recording.is_sequential,
                           _find_height(recording, height, mixed))
 
 
 def _find_height(recording: Recording, height: float, mixed: bool) -> float | None:
-    if height and not (mixed and recording.mounted):
+    if height and not (mixed and recording.has_sensor_height):
         return height
     measured = apply_measured_height(recording, load_first_clouds(recording))
     return None if measured is recording else next(iter(measured)).sensor_height

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.open import open_recording, with_topic
+from lidar_perception.data.open import open_recording, split_topic
 from lidar_perception.simulation.camera import (
     FORWARD_CAMERA,
     kitti_labels,
@@ -66,7 +66,7 @@ class RecordedScenes:
     def key(self, i: int) -> str:
         """Return a cache key of scene i, which changes when one of its files is written."""
         frame = self._frames[self.names[i]]
-        return repr((*map(file_fingerprint, frame.files), with_topic(self.path)[1], frame.name,
+        return repr((*map(file_fingerprint, frame.files), split_topic(self.path)[1], frame.name,
                      self.view, frame.sensor_height))
 
     def scene(self, i: int) -> TrainingScene:

@@ -119,14 +119,14 @@ def _listening(namespace: str, points: str, detections: tuple[str, ...]) -> Iter
 def _served(path: Path, detectors: tuple[DetectorChoice, ...], results: tuple[Path, ...],
             points: str | None, sequence: str | None) -> Served:
     """What the page shows of a path."""
-    from lidar_perception.data.bag_frames import recognises
-    from lidar_perception.data.open import with_topic
+    from lidar_perception.data.bag_frames import is_layout
+    from lidar_perception.data.open import split_topic
     from lidar_studio import results as shown
     from lidar_studio.drive import one_drive, require_clouds
     from lidar_studio.served import Served
 
-    path, named = with_topic(path)
-    a_bag = path.exists() and recognises(path)
+    path, named = split_topic(path)
+    a_bag = path.exists() and is_layout(path)
     recording = (opened(path, points=points or named or shown.points_topic(path)) if a_bag
                  else opened(path))
     with looking_through(path):

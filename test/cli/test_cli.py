@@ -213,7 +213,8 @@ def test_what_is_wrong_in_a_bag_is_said_in_one_line_and_the_command_goes_on(bag,
         result = CliRunner().invoke(cli, [*map(str, command)], catch_exceptions=False)
         assert result.exit_code == 0
         warned, = [line for line in result.stderr.splitlines() if "warning" in line]
-        assert warned.startswith(f"warning: {tmp_path}/bag/metadata.yaml is wrong: it says 9")
+        assert warned.startswith(
+            f"warning: {tmp_path}/bag/metadata.yaml does not match the bag: it declares 9")
 
 
 def test_info_lists_topics_that_are_not_read(tmp_path):
@@ -470,15 +471,16 @@ def test_a_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
 
 
 BAD_INPUTS = {
-    "missing bag": (["info", "{tmp}/none"], "there is no bag {tmp}/none"),
+    "missing bag": (["info", "{tmp}/none"], "the bag {tmp}/none does not exist"),
     "too long a name": (["info", f"{{tmp}}/{300 * 'a'}"], "a: File name too long"),
     "no bag": (["info", "{tmp}"], "{tmp} has no metadata.yaml and is no other recording: "
                "expected a rosbag2 bag, or the folder of KITTI"),
-    "missing data": (["convert", "{tmp}/none", "--out", "{tmp}/o"], "there is no {tmp}/none"),
-    "no data": (["convert", "{tmp}", "--out", "{tmp}/o"], "{tmp} is no recording that can be read"),
+    "missing data": (["convert", "{tmp}/none", "--out", "{tmp}/o"], "{tmp}/none does not exist"),
+    "no data": (["convert", "{tmp}", "--out", "{tmp}/o"],
+                "{tmp} is not a recording in a supported format"),
     "existing out": (["convert", "{kitti}", "--out", "{bag}"], "exists already"),
     "out is a file": (["convert", "{kitti}", "--out", "{kitti}/training/calib/000000.txt",
-                       "--force"], "is no bag"),
+                       "--force"], "is not a bag"),
     "out under a file": (["convert", "{kitti}", "--out",
                           "{kitti}/training/calib/000000.txt/o"], "cannot make the folder"),
     "out of range": (["evaluate", "candidates", "--data", "{bag}", "--set",
@@ -518,7 +520,7 @@ def test_a_bag_without_a_cloud_is_bad_input(tmp_path, monkeypatch, capsys):
     for command in "nuscenes", "detection":
         assert exit_of(monkeypatch, "evaluate", command, "--data", tmp_path / "bag", "--weights",
                        "fused", "--write-results", tmp_path / "out") == 2
-        assert "has no frame" in error_line(capsys)
+        assert "has no frames" in error_line(capsys)
 
 
 def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch, capsys):
@@ -577,7 +579,7 @@ def test_the_closest_name_is_found_where_there_is_one(name, known, closest):
 
 
 @pytest.mark.parametrize("arguments, code, words", [
-    (["--version"], 0, ""), (["info", "none"], 2, "Error: there is no bag none\n")])
+    (["--version"], 0, ""), (["info", "none"], 2, "Error: the bag none does not exist\n")])
 def test_the_process_ends_with_the_code(arguments, code, words, tmp_path):
     done = subprocess.run([sys.executable, "-m", "lidar_perception.cli.main", *arguments],
                           cwd=tmp_path, capture_output=True, text=True)

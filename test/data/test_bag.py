@@ -1,4 +1,4 @@
-"""Bags: what was written is read, by us and by others."""
+"""Reading and writing of bags."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, IMAGE, POINTS,
 from msg_utils.point_cloud2 import to_array
 
 
-def test_a_recording_gives_back_the_scans(written):
+def test_recording_returns_the_written_scans(written):
     recording = open_recording(written)
     assert len(recording) == 3
     for i, (scan, read) in enumerate(zip(scans(), recording, strict=True)):
@@ -46,7 +46,7 @@ def test_a_recording_gives_back_the_scans(written):
         assert (camera.width, camera.height) == (expected.width, expected.height)
 
 
-def test_clouds_are_in_the_bag_bit_by_bit_with_intensity(tmp_path):
+def test_clouds_are_stored_bit_by_bit(tmp_path):
     cloud = np.array([[1, 2, 3, 0.5], [np.nan, -0.0, np.inf, -1], [0, 0, 0, 0]], np.float32)
     write_bag(tmp_path / "bag", [
         Frame.of(str(i), cloud_frame(part, STAMP + i))
@@ -57,13 +57,13 @@ def test_clouds_are_in_the_bag_bit_by_bit_with_intensity(tmp_path):
     assert full.tobytes() == cloud.tobytes()
 
 
-def test_what_a_scan_lacks_is_not_in_the_bag(tmp_path):
+def test_missing_parts_of_a_scan_are_not_written(tmp_path):
     write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP))])
     recording = open_recording(tmp_path / "bag")
     read, = recording
     assert read.truth() is None and read.camera() is None and read.pose() is None
     with Bag(tmp_path / "bag") as bag:
-        assert {t for t, _, _ in bag.raw()} == {POINTS}
+        assert {t for t, _, _ in bag.raw_messages()} == {POINTS}
 
 
 def test_empty_labels_are_not_missing_labels(tmp_path):
@@ -73,7 +73,7 @@ def test_empty_labels_are_not_missing_labels(tmp_path):
     assert len(read.truth()) == 0
 
 
-def test_images_are_in_the_bag_byte_by_byte(tmp_path):
+def test_images_are_stored_byte_by_byte(tmp_path):
     image = write(tmp_path / "image.png", png_header(3, 2) + b"pixels")
     write_bag(tmp_path / "bag", [
         Frame.of("0", cloud_frame(scene(), STAMP), image=image)], images=True)
@@ -82,7 +82,7 @@ def test_images_are_in_the_bag_byte_by_byte(tmp_path):
     assert (bytes(msg.data), msg.format, stamp) == (image.read_bytes(), "png", STAMP)
 
 
-def test_a_calibration_is_written_when_it_changes_and_before_its_cloud(written):
+def test_calibration_is_written_before_its_cloud_when_it_changes(written):
     order = [(t, s) for t, s, _ in message_bytes(written)]
     for topic in LATCHED:
         assert [s for t, s in order if t == topic] == [STAMP, STAMP + 2 * 10**8]
@@ -100,7 +100,7 @@ def test_rosbags_reads_the_bag(written):
     assert types[POINTS] == "sensor_msgs/msg/PointCloud2"
 
 
-def test_mcap_reads_the_bag_and_its_checksums_hold(written):
+def test_mcap_reads_the_bag_and_verifies_its_checksums(written):
     with open(written / "drive.mcap", "rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         got = [(channel.topic, m.log_time, m.data, channel.message_encoding, schema.encoding)
@@ -109,7 +109,7 @@ def test_mcap_reads_the_bag_and_its_checksums_hold(written):
     assert sorted(got) == sorted((*row, "cdr", "ros2msg") for row in message_bytes(written))
 
 
-def test_chunks_are_zstd_and_hold_more_than_one_cloud(tmp_path):
+def test_zstd_chunks_hold_several_clouds(tmp_path):
     cloud = np.random.default_rng(0).random((60_000, 4), np.float32)
     count = write_bag(tmp_path / "bag", (
         Frame.of(str(i), cloud_frame(cloud, STAMP + i)) for i in range(12)))
@@ -133,7 +133,7 @@ def test_calibrations_are_latched_and_clouds_are_not(written):
         assert (quality["durability"] == "transient_local") == (channel.topic in LATCHED)
 
 
-def test_metadata_counts_what_is_in_the_file(written):
+def test_metadata_matches_the_file(written):
     info = yaml.safe_load((written / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     rows = message_bytes(written)
     counts = {t["topic_metadata"]["name"]: t["message_count"]
@@ -148,14 +148,14 @@ def test_metadata_counts_what_is_in_the_file(written):
         assert (bag.start_ns, bag.counts) == (STAMP, counts)
 
 
-def test_a_bag_without_messages_can_be_written_and_has_no_frame(tmp_path):
+def test_bag_without_messages_has_no_frames(tmp_path):
     assert write_bag(tmp_path / "bag", []) == 0
-    with pytest.raises(InputError, match=r"bag .* has no frame; record"):
+    with pytest.raises(InputError, match=r"bag .* has no frames; record"):
         open_recording(tmp_path / "bag")
 
 
 @pytest.mark.no_cover
-def test_bags_of_sqlite_are_read_alike(written, tmp_path):
+def test_sqlite_bag_is_read_like_mcap(written, tmp_path):
     copy_bag(written, tmp_path / "sql", "sqlite3")
     for a, b in zip(open_recording(written), open_recording(tmp_path / "sql"), strict=True):
         assert same_cloud(a.load().xyz, b.load().xyz)
@@ -163,44 +163,43 @@ def test_bags_of_sqlite_are_read_alike(written, tmp_path):
         assert (a.truth() is None) == (b.truth() is None)
 
 
-def cloud_of(frames, i):
+def load_bytes(frames, i):
     return frames[i].load().xyz.tobytes()
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_single_clouds_are_those_of_the_whole_in_any_order_thread_and_process(written, tmp_path,
-                                                                              storage):
-    """And however many they are, a thread opens the bag once: its index may be long."""
+def test_frames_can_be_loaded_in_any_order_thread_and_process(written, tmp_path, storage):
+    """Each thread opens the bag once, as its index may be long."""
     copy_bag(written, tmp_path / "bag", storage)
     frames = open_recording(tmp_path / "bag").frames
     expected = [frame.load().xyz.tobytes() for frame in frames]
     order = [2, 0, 1] * 4
 
     def same(i):
-        return cloud_of(frames, i) == expected[i]
+        return load_bytes(frames, i) == expected[i]
 
     with ThreadPoolExecutor(3) as pool:
         assert all(map(same, order)) and all(pool.map(same, order))
     with ProcessPoolExecutor(2, multiprocessing.get_context("fork")) as pool:
-        assert list(pool.map(partial(cloud_of, frames), order)) == [expected[i] for i in order]
+        assert list(pool.map(partial(load_bytes, frames), order)) == [expected[i] for i in order]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Bag, "__init__", None)
         assert all(map(same, order))
 
 
-def test_raw_takes_topics_and_a_window_of_time(written):
+def test_raw_messages_are_selected_by_topic_and_time(written):
     rows = message_bytes(written)
     with Bag(written) as bag:
-        assert list(bag.raw({POINTS, TRUTH})) == [r for r in rows if r[0] in (POINTS, TRUTH)]
-        assert list(bag.raw(set())) == []
+        chosen = {POINTS, TRUTH}
+        assert list(bag.raw_messages(chosen)) == [row for row in rows if row[0] in chosen]
+        assert list(bag.raw_messages(set())) == []
         low, high = STAMP + 1, STAMP + 2 * 10**8
-        assert list(bag.raw(None, low, high)) == [r for r in rows if low <= r[1] < high]
+        assert list(bag.raw_messages(None, low, high)) == [r for r in rows if low <= r[1] < high]
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_messages_without_chunks_are_read_in_order_of_time_and_none_for_another(
-        written, tmp_path, monkeypatch, turned):
-    """As `ros2 bag record` leaves them with its preset fastwrite."""
+@pytest.mark.parametrize("reverse", [False, True])
+def test_messages_without_chunks_are_read_one_by_one(written, tmp_path, monkeypatch, reverse):
+    """`ros2 bag record` writes no chunks with its preset fastwrite."""
     path, rows = tmp_path / "fast.mcap", message_bytes(written)
     last = max(time for _, time, _ in rows)
     with open(written / "drive.mcap", "rb") as stream, open(path, "wb") as out:
@@ -208,7 +207,7 @@ def test_messages_without_chunks_are_read_in_order_of_time_and_none_for_another(
         writer.start("ros2")
         found = list(make_reader(stream).iter_messages())
         for schema, channel, message in sorted(found, key=lambda row: row[2].log_time,
-                                               reverse=turned):
+                                               reverse=reverse):
             if channel.id not in channels:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.id] = writer.register_channel(
@@ -221,14 +220,14 @@ def test_messages_without_chunks_are_read_in_order_of_time_and_none_for_another(
     monkeypatch.setattr(os, "pread", lambda file, size, at: read.append(size) or pread(
         file, size, at))
     with Bag(path) as bag:
-        list(bag.raw())
+        list(bag.raw_messages())
         read.clear()
-        _, _, data = next(bag.raw({POINTS}, last, last + 1))
+        _, _, data = next(bag.raw_messages({POINTS}, last, last + 1))
     assert read == [len(data)]
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_the_files_of_a_split_bag_are_read_in_order_of_time(tmp_path, storage):
+def test_files_of_a_split_bag_are_read_in_order_of_time(tmp_path, storage):
     parts = []
     for name, stamps in (("late", (30, 40)), ("early", (10, 20))):
         with BagWriter(tmp_path / f"{name}_ours") as bag:

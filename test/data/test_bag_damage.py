@@ -1,4 +1,4 @@
-"""Bags that stand in the way, are damaged, or are none: nothing is lost, and each is named."""
+"""Bags that exist already, are damaged, or are not bags: nothing is lost, and each is reported."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from lidar_perception.wire.topics import POINTS
 from msg_utils.point_cloud2 import from_array
 
 
-def test_an_existing_bag_is_replaced_only_by_force(tmp_path):
+def test_existing_bag_is_replaced_only_with_force(tmp_path):
     path = tmp_path / "bag"
     write_bag(path, scans(1))
     before = message_bytes(path)
@@ -38,9 +38,9 @@ def test_an_existing_bag_is_replaced_only_by_force(tmp_path):
 
 @pytest.mark.parametrize("make", [lambda p: write(p / "bag", b"text"),
                                   lambda p: write(p / "bag/notes.txt", b"text")])
-def test_force_replaces_nothing_but_bags(tmp_path, make):
+def test_force_replaces_only_bags(tmp_path, make):
     kept = make(tmp_path)
-    with pytest.raises(InputError, match="is no bag"):
+    with pytest.raises(InputError, match="is not a bag"):
         write_bag(tmp_path / "bag", scans(1), force=True)
     assert kept.read_bytes() == b"text"
     write_bag(tmp_path / "other", scans(1))
@@ -51,7 +51,7 @@ def test_force_replaces_nothing_but_bags(tmp_path, make):
 
 
 @pytest.mark.parametrize("force", [False, True])
-def test_an_exception_leaves_the_old_bag_and_an_incomplete_one_that_can_be_read(tmp_path, force):
+def test_exception_leaves_old_bag_and_readable_incomplete_one(tmp_path, force):
     path = tmp_path / "bag"
     if force:
         write_bag(path, scans(1))
@@ -65,28 +65,29 @@ def test_an_exception_leaves_the_old_bag_and_an_incomplete_one_that_can_be_read(
         write_bag(path, failing(), force=force)
     assert len(list(open_recording(tmp_path / "bag.incomplete"))) == 2
     assert (message_bytes(path) == before) if force else not path.exists()
-    write_bag(path, scans(3), force=force)  # what is left over is no obstacle
+    write_bag(path, scans(3), force=force)  # the incomplete bag is replaced
     assert len(open_recording(path)) == 3
     assert not (tmp_path / "bag.incomplete").exists()
 
 
-def test_a_place_that_cannot_hold_a_bag_is_named(tmp_path):
+def test_invalid_target_folder_is_reported(tmp_path):
     write(tmp_path / "file", b"")
     with pytest.raises(InputError, match=r"cannot make the folder .*file/bag"):
         write_bag(tmp_path / "file/bag", scans(1))
 
 
 @pytest.fixture
-def room():
-    """room(bytes): no file may grow larger; a write beyond fails as it does on a full disk."""
+def limit_file_size():
+    """Return a function that limits the size of files, as a full disk does."""
     _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, hard))
 
 
 @pytest.mark.no_cover
-def test_on_a_full_disk_what_found_room_can_be_read(tmp_path, monkeypatch, room):
-    """Wherever it gets full: in a chunk, in the index, in metadata.yaml."""
+def test_messages_written_before_the_disk_was_full_are_readable(tmp_path, monkeypatch,
+                                                                limit_file_size):
+    """The disk may be full in a chunk, in the index, or in metadata.yaml."""
     monkeypatch.setattr(bag_module, "CHUNK_BYTES", 20_000)
     rng = np.random.default_rng(0)
     drive = [Frame.of(str(i), cloud_frame(rng.random((1000, 4), np.float32), STAMP + i))
@@ -96,10 +97,10 @@ def test_on_a_full_disk_what_found_room_can_be_read(tmp_path, monkeypatch, room)
     size = (tmp_path / "all/all.mcap").stat().st_size
     read = []
     for full in [*range(10_000, size, 6007), *range(size - 400, size, 7)]:
-        room(full)
+        limit_file_size(full)
         with pytest.raises(InputError, match=r"cannot write the bag .*bag\.incomplete") as error:
             write_bag(tmp_path / "bag", drive)
-        room(resource.RLIM_INFINITY)
+        limit_file_size(resource.RLIM_INFINITY)
         assert "\n" not in str(error.value) and not (tmp_path / "bag").exists()
         rows = message_bytes(tmp_path / "bag.incomplete")
         assert rows == whole[:len(rows)]
@@ -109,7 +110,7 @@ def test_on_a_full_disk_what_found_room_can_be_read(tmp_path, monkeypatch, room)
     assert message_bytes(tmp_path / "bag") == whole
 
 
-def test_a_second_writer_of_the_same_bag_leaves_the_first_alone(tmp_path):
+def test_second_writer_of_the_same_bag_is_rejected(tmp_path):
     path, first = tmp_path / "bag", scans(2)
 
     def slow():
@@ -123,7 +124,7 @@ def test_a_second_writer_of_the_same_bag_leaves_the_first_alone(tmp_path):
     assert len(open_recording(path)) == 2
 
 
-def test_a_bag_that_came_while_waiting_to_write_is_kept(tmp_path):
+def test_bag_written_meanwhile_is_kept(tmp_path):
     late = BagWriter(tmp_path / "bag")
     write_bag(tmp_path / "bag", scans(2))
     with pytest.raises(InputError, match="exists already"), late:
@@ -131,7 +132,7 @@ def test_a_bag_that_came_while_waiting_to_write_is_kept(tmp_path):
     assert len(open_recording(tmp_path / "bag")) == 2
 
 
-def test_a_folder_without_metadata_is_read_by_its_one_file(written, tmp_path):
+def test_folder_without_metadata_is_read_from_its_only_file(written, tmp_path):
     shutil.copy(written / "drive.mcap", tmp_path)
     assert message_bytes(tmp_path) == message_bytes(written)
     assert message_bytes(tmp_path / "drive.mcap") == message_bytes(written)
@@ -140,7 +141,7 @@ def test_a_folder_without_metadata_is_read_by_its_one_file(written, tmp_path):
         Bag(tmp_path)
 
 
-def mcap_of(path, profile):
+def write_empty_mcap(path, profile):
     with open(path, "wb") as stream:
         writer = Writer(stream)
         writer.start(profile=profile)
@@ -148,18 +149,18 @@ def mcap_of(path, profile):
 
 
 @pytest.mark.parametrize("name, make, words", [
-    ("missing", lambda p: None, "there is no bag"),
+    ("missing", lambda p: None, "does not exist"),
     ("folder", lambda p: p.mkdir(), "no metadata.yaml and 0 storage files"),
-    ("cloud.bin", lambda p: write(p, b"1234"), "is no bag"),
+    ("cloud.bin", lambda p: write(p, b"1234"), "is not a bag"),
     ("empty.mcap", lambda p: write(p, b""), "truncated or damaged"),
     ("text.mcap", lambda p: write(p, b"text " * 100), "truncated or damaged"),
-    ("old.mcap", lambda p: mcap_of(p, "ros1"), "messages of ROS 1 in MCAP; give the .bag"),
-    ("other.mcap", lambda p: mcap_of(p, ""), "no bag of ROS 2 (profile ''), as Foxglove"),
+    ("old.mcap", lambda p: write_empty_mcap(p, "ros1"), "ROS 1 messages in MCAP; give the .bag"),
+    ("other.mcap", lambda p: write_empty_mcap(p, ""), "without ROS 2 messages (profile '')"),
     ("text.db3", lambda p: write(p, b"text " * 100), "truncated or damaged"),
     ("bag", lambda p: write(p / "metadata.yaml", "text"), "truncated or damaged"),
     ("bag", lambda p: write(p / "metadata.yaml", "a: [\n"), "truncated or damaged"),
 ])
-def test_what_is_no_bag_is_named_in_one_line(tmp_path, name, make, words):
+def test_invalid_bag_is_reported_in_one_line(tmp_path, name, make, words):
     make(tmp_path / name)
     with pytest.raises(InputError) as error:
         Bag(tmp_path / name)
@@ -167,7 +168,7 @@ def test_what_is_no_bag_is_named_in_one_line(tmp_path, name, make, words):
     assert "\n" not in str(error.value)
 
 
-def test_a_bag_without_its_file_is_damaged(written, tmp_path):
+def test_bag_without_its_storage_file_is_damaged(written, tmp_path):
     shutil.copy(written / "metadata.yaml", tmp_path)
     with pytest.raises(InputError, match="truncated or damaged"):
         message_bytes(tmp_path)
@@ -175,7 +176,7 @@ def test_a_bag_without_its_file_is_damaged(written, tmp_path):
 
 @pytest.mark.parametrize("folder", [True, False])
 @pytest.mark.no_cover
-def test_a_bag_that_was_cut_anywhere_is_damaged(written, tmp_path, folder):
+def test_truncated_bag_is_reported(written, tmp_path, folder):
     raw = (written / "drive.mcap").read_bytes()
     if folder:
         shutil.copy(written / "metadata.yaml", tmp_path)
@@ -186,11 +187,11 @@ def test_a_bag_that_was_cut_anywhere_is_damaged(written, tmp_path, folder):
             message_bytes(tmp_path if folder else path)
 
 
-def read_or_named(path):
-    """The messages, or None where the bag says in one line that it is damaged."""
+def read_unless_damaged(path):
+    """Return the messages, or None if the bag is reported as damaged, in one line."""
     try:
         with Bag(path) as bag:
-            rows = list(bag.raw())
+            rows = list(bag.raw_messages())
             assert {t: sum(row[0] == t for row in rows) for t in bag.topics} == bag.counts
         return rows
     except InputError as error:
@@ -207,24 +208,23 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 @pytest.mark.no_cover
-def test_a_damaged_byte_never_changes_what_is_read_without_a_word(written, tmp_path, damage):
-    """In the data, at the head of a chunk, and in the index, from which readers take where the
-    messages are."""
+def test_damaged_byte_is_reported_or_changes_nothing(written, tmp_path, damage):
+    """Damage in the data, at the head of a chunk, and in the index."""
     raw, before = (written / "drive.mcap").read_bytes(), message_bytes(written)
-    path, named = tmp_path / "drive.mcap", 0
+    path, reported = tmp_path / "drive.mcap", 0
     with open(written / "drive.mcap", "rb") as stream:
         chunk = make_reader(stream).get_summary().chunk_indexes[0].chunk_start_offset
-    places = [*range(8, len(raw), len(raw) // 40), *range(chunk, chunk + 60, 3),
-              *range(len(raw) - 4000, len(raw), 41)]
-    for at in places:
+    offsets = [*range(8, len(raw), len(raw) // 40), *range(chunk, chunk + 60, 3),
+               *range(len(raw) - 4000, len(raw), 41)]
+    for at in offsets:
         path.write_bytes(damage(raw, at))
-        rows = read_or_named(path)
+        rows = read_unless_damaged(path)
         assert rows in (None, before)
-        named += rows is None
-    assert named > 0.8 * len(places)
+        reported += rows is None
+    assert reported > 0.8 * len(offsets)
 
 
-def test_an_index_without_a_checksum_is_compared_with_the_data(written, tmp_path):
+def test_index_without_checksum_is_compared_with_the_data(written, tmp_path):
     copy_bag(written, tmp_path / "plain", "mcap")
     source = tmp_path / "plain/plain.mcap"
     raw = source.read_bytes()
@@ -232,14 +232,14 @@ def test_an_index_without_a_checksum_is_compared_with_the_data(written, tmp_path
         index = make_reader(stream).get_summary().chunk_indexes[0]
     at = raw.index(struct.pack("<QQQQ", index.message_start_time, index.message_end_time,
                                index.chunk_start_offset, index.chunk_length))
-    assert read_or_named(source) == message_bytes(written)
+    assert read_unless_damaged(source) == message_bytes(written)
     path = tmp_path / "drive.mcap"
     for byte in range(at, at + 32):
         path.write_bytes(DAMAGES["flipped"](raw, byte))
-        assert read_or_named(path) is None
+        assert read_unless_damaged(path) is None
 
 
-def test_a_chunk_that_says_it_unpacks_to_terabytes_is_not_unpacked(written, tmp_path):
+def test_chunk_that_declares_terabytes_is_rejected(written, tmp_path):
     raw = bytearray((written / "drive.mcap").read_bytes())
     with open(written / "drive.mcap", "rb") as stream:
         at = make_reader(stream).get_summary().chunk_indexes[0].chunk_start_offset
@@ -249,7 +249,7 @@ def test_a_chunk_that_says_it_unpacks_to_terabytes_is_not_unpacked(written, tmp_
         Bag(tmp_path / "drive.mcap")
 
 
-def test_a_bag_without_clouds_says_what_it_has(tmp_path):
+def test_bag_without_clouds_lists_its_topics(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/text", "std_msgs/msg/String")
         bag.write("/text", 1, bag_message("std_msgs/msg/String", data="hello"))
@@ -260,7 +260,7 @@ def test_a_bag_without_clouds_says_what_it_has(tmp_path):
         assert word in str(error.value)
 
 
-def test_a_cloud_that_cannot_be_used_leaves_the_others(tmp_path):
+def test_unusable_cloud_does_not_affect_others(tmp_path):
     cloud = scene()[:, :2].copy().view([("x", "<f4"), ("y", "<f4")]).reshape(-1)
     write_bag(tmp_path / "bag", scans(1))
     with BagWriter(tmp_path / "mixed") as bag:

@@ -1,4 +1,4 @@
-"""Frames of a bag, and of a bag that is made of any recording."""
+"""Frames of a bag, and bags converted from any recording."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from samples import STAMP, header, object_folder, scene, walker_truth, write
 
 from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import Bag, BagWriter
-from lidar_perception.data.drives import drives_of
+from lidar_perception.data.drives import split_drives
 from lidar_perception.data.frame import CAMERA, Frame
 from lidar_perception.data.open import open_recording
-from lidar_perception.data.to_bag import points_of, write_bag
+from lidar_perception.data.to_bag import to_point_array, write_bag
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_truth_markers
@@ -29,9 +29,9 @@ def same_frames(a, b):
         a.load().xyz, b.load().xyz)
 
 
-def test_frames_of_a_bag_by_number_are_those_of_iterating(written, tmp_path):
+def test_indexed_frames_equal_iterated_frames(written, tmp_path):
     clouds = [row for row in message_bytes(written) if row[0] == POINTS]
-    with BagWriter(tmp_path / "equal") as bag:  # three at the same time, two of the same stamp
+    with BagWriter(tmp_path / "equal") as bag:  # three with the same time, two with the same stamp
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
         bag.add_topic("/other", "sensor_msgs/msg/PointCloud2")
         for i, time in ((2, 5), (0, 7), (1, 7), (0, 7), (2, 9)):
@@ -49,15 +49,15 @@ def test_frames_of_a_bag_by_number_are_those_of_iterating(written, tmp_path):
         for i in (count, -count - 1):
             with pytest.raises(IndexError):
                 recording.frames[i]
-    assert [scene_of(f) for f in frames] == [2, 0, 1, 0, 2]
+    assert [find_scene(f) for f in frames] == [2, 0, 1, 0, 2]
 
 
-def scene_of(frame):
+def find_scene(frame):
     return next(i for i in range(3) if same_cloud(scene(i), frame.load().xyz))
 
 
-def test_the_first_frame_is_known_without_a_look_through_the_bag(written, monkeypatch):
-    """An hour of clouds takes minutes to look through, and many commands ask for the first only."""
+def test_first_frame_needs_no_scan_of_the_bag(written, monkeypatch):
+    """Scanning an hour of clouds takes minutes, and many commands need the first one only."""
     stamped = []
     monkeypatch.setattr(bag_frames.BagFrames, "_stamp",
                         lambda self, data, time: stamped.append(time) or time)
@@ -66,7 +66,7 @@ def test_the_first_frame_is_known_without_a_look_through_the_bag(written, monkey
     assert frames[1].index == 1 and len({*stamped}) == 3
 
 
-def test_a_frame_of_a_bag_by_number_is_read_when_it_is_asked_for(written, tmp_path):
+def test_indexed_frame_is_read_when_it_is_loaded(written, tmp_path):
     shutil.copytree(written, tmp_path / "bag")
     frame = open_recording(tmp_path / "bag").frames[1]
     os.truncate(tmp_path / "bag/drive.mcap", 100)
@@ -74,13 +74,13 @@ def test_a_frame_of_a_bag_by_number_is_read_when_it_is_asked_for(written, tmp_pa
         frame.load()
 
 
-def test_a_bag_has_what_is_in_it_and_not_what_could_be(tmp_path):
+def test_has_lists_only_recorded_content(tmp_path):
     write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP))])
     assert open_recording(tmp_path / "bag").has == set()
 
 
 @each_recording
-def test_a_bag_made_of_a_recording_says_the_same(tmp_path, kind):
+def test_converted_bag_equals_the_recording(tmp_path, kind):
     recording = open_recording(MADE[kind][0](tmp_path / kind))
     assert write_bag(tmp_path / "made", recording) == len(recording)
     bag = open_recording(tmp_path / "made")
@@ -108,11 +108,11 @@ def test_a_bag_made_of_a_recording_says_the_same(tmp_path, kind):
                 assert a.keys() == b.keys()
                 np.testing.assert_equal([a.get("track_id"), a.get("category")],
                                         [b.get("track_id"), b.get("category")])
-    with Bag(tmp_path / "made") as opened:  # a calibration is written when it changes
-        assert opened.counts[CAMERA_INFO] == (CAMERA in recording.has) * (1 + (kind == "bag"))
+    with Bag(tmp_path / "made") as converted:  # the calibration is written when it changes
+        assert converted.counts[CAMERA_INFO] == (CAMERA in recording.has) * (1 + (kind == "bag"))
 
 
-def test_a_scan_that_cannot_be_read_is_left_out_of_a_bag_and_named(tmp_path):
+def test_unreadable_scan_is_skipped_and_reported(tmp_path):
     root = object_folder(tmp_path / "kitti", count=3)
     write(root / "training/velodyne/000001.bin", b"cut")
     with pytest.raises(InputError, match=r"000001\.bin"):
@@ -120,10 +120,10 @@ def test_a_scan_that_cannot_be_read_is_left_out_of_a_bag_and_named(tmp_path):
     skipped = []
     assert write_bag(tmp_path / "bag", open_recording(root), skipped=skipped) == 2
     assert len(skipped) == 1 and "000001.bin" in skipped[0]
-    assert [scene_of(f) for f in open_recording(tmp_path / "bag")] == [0, 2]
+    assert [find_scene(f) for f in open_recording(tmp_path / "bag")] == [0, 2]
 
 
-def test_a_scan_with_a_stamp_that_no_bag_can_hold_is_left_out_and_named(tmp_path):
+def test_scan_with_negative_stamp_is_skipped_and_reported(tmp_path):
     scans, skipped = [Frame.of(str(t), cloud_frame(scene(), t)) for t in (-5, 7)], []
     assert write_bag(tmp_path / "bag", scans, skipped=skipped) == 1
     assert "-5" in skipped[0] and open_recording(tmp_path / "bag").frames[0].stamp_ns == 7
@@ -132,17 +132,18 @@ def test_a_scan_with_a_stamp_that_no_bag_can_hold_is_left_out_and_named(tmp_path
 @pytest.mark.parametrize("stamps, expected", [
     ([0, 1, 2], [0, 1, 2]), ([0, 0, 2], [0, 0, 2]), ([5, 0, 2], [5, 0, 2]), ([0, 0], [70, 71]),
     ([0], [70])])
-def test_stamps_of_0_count_unless_all_are_0(tmp_path, stamps, expected):
-    """Simulated time begins at 0; a driver that sets no stamp leaves them all 0."""
+def test_zero_stamps_are_replaced_only_if_all_are_zero(tmp_path, stamps, expected):
+    """Simulated time starts at 0; drivers that set no stamp leave all of them 0."""
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
         bag.add_topic(TRUTH, "visualization_msgs/msg/MarkerArray")
         for i, stamp in enumerate(stamps):
             head = header(bag_message, stamp)
-            bag.write(POINTS, 70 + i, from_array(points_of(scans(1)[0].load()), head, bag_message))
+            points = to_point_array(scans(1)[0].load())
+            bag.write(POINTS, 70 + i, from_array(points, head, bag_message))
             bag.write(TRUTH, 70 + i, make_truth_markers(walker_truth(), head, bag_message))
     recording = open_recording(tmp_path / "bag")
     assert [frame.stamp_ns for frame in recording] == expected
     assert [frame.stamp_ns for frame in recording.frames[:]] == expected
     assert all(frame.truth() is not None for frame in recording)
-    assert len(drives_of(recording.frames)[""]) == (1 if expected == sorted(expected) else 2)
+    assert len(split_drives(recording.frames)[""]) == (1 if expected == sorted(expected) else 2)

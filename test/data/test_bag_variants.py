@@ -1,4 +1,4 @@
-"""Bags as other recorders, other versions and other people leave them: all read alike."""
+"""Bags as other recorders, versions and people write them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STATE = "my_robot_msgs/msg/State"
 
 @pytest.fixture(autouse=True)
 def no_warning():
-    """A test that does not ask for a warning gets none."""
+    """Turn warnings into errors, except in tests that expect one."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", InputWarning)
         yield
@@ -46,7 +46,7 @@ def rows(written):
 
 def write_mcap(path, bag, rows, *, profile="ros2", encoding="cdr", definition="ros2msg",
                short_names=False, channels=1, late=False, **options):
-    """rows on `channels` channels for each topic; late: their channels are defined first."""
+    """Write rows to `channels` channels per topic. With `late`, all channels are defined first."""
     with open(path, "wb") as stream:
         writer = Writer(stream, **options)
         writer.start(profile=profile)
@@ -84,31 +84,31 @@ NO_SUMMARY = dict(index_types=IndexType.NONE, repeat_channels=False, repeat_sche
     dict(definition="ros2idl"), dict(definition="unknown"), dict(definition=""),
     dict(short_names=True), dict(encoding=""), dict(channels=3),
 ], ids=str)
-def test_mcap_of_any_writer_is_read(written, rows, tmp_path, options):
+def test_mcap_file_of_any_writer_is_read(written, rows, tmp_path, options):
     with Bag(written) as bag:
         path = write_mcap(tmp_path / "a.mcap", bag, rows, **options)
         with Bag(path) as other:
             assert (other.topics, other.counts) == (bag.topics, bag.counts)
             assert (other.start_ns, other.end_ns) == (bag.start_ns, bag.end_ns)
-            assert list(other.raw()) == rows
+            assert list(other.raw_messages()) == rows
             last = rows[-1][1]
-            assert list(other.raw(None, last)) == [row for row in rows if row[1] == last]
+            assert list(other.raw_messages(None, last)) == [row for row in rows if row[1] == last]
 
 
-def test_messages_in_and_outside_of_chunks_are_merged(written, rows, tmp_path):
+def test_messages_inside_and_outside_chunks_are_merged(written, rows, tmp_path):
     """The MCAP specification allows both in one file."""
     with Bag(written) as bag:
         plain = write_mcap(tmp_path / "a", bag, rows[::2], late=True,
                            use_chunking=False, **NO_SUMMARY)
-        packed = write_mcap(tmp_path / "b", bag, rows[1::2], late=True, chunk_size=1,
-                            **NO_SUMMARY)
-    body, end = plain.read_bytes()[:-37 - 13], packed.read_bytes()
+        chunked = write_mcap(tmp_path / "b", bag, rows[1::2], late=True, chunk_size=1,
+                             **NO_SUMMARY)
+    body, end = plain.read_bytes()[:-37 - 13], chunked.read_bytes()
     header = 8 + 9 + int.from_bytes(end[9:17], "little")
     (tmp_path / "c.mcap").write_bytes(body + end[header:])
     assert sorted(message_bytes(tmp_path / "c.mcap")) == sorted(rows)
 
 
-def test_topics_that_nothing_reads_leave_the_others(written, rows, tmp_path):
+def test_unreadable_topics_do_not_affect_others(written, rows, tmp_path):
     with open(tmp_path / "a.mcap", "wb") as stream:
         writer = Writer(stream)
         writer.start(profile="")
@@ -130,7 +130,7 @@ def test_topics_that_nothing_reads_leave_the_others(written, rows, tmp_path):
             bag.require("/log")
 
 
-def test_a_topic_of_two_types_is_read_as_the_more_frequent_one(written, rows, tmp_path):
+def test_topic_with_two_types_is_read_as_the_frequent_one(written, rows, tmp_path):
     clouds = [row for row in rows if row[0] == POINTS]
     with open(tmp_path / "a.mcap", "wb") as stream:
         writer = Writer(stream)
@@ -141,12 +141,12 @@ def test_a_topic_of_two_types_is_read_as_the_more_frequent_one(written, rows, tm
             for _, time, data in found:
                 writer.add_message(channel, time, data, time)
         writer.finish()
-    with pytest.warns(InputWarning, match=f"of several types; those of .*PointCloud2 are read, "
+    with pytest.warns(InputWarning, match=f"of several types; only .*PointCloud2 is read, "
                                           f"not 1 of {STATE}"):
         assert message_bytes(tmp_path / "a.mcap") == clouds
 
 
-SCHEMAS = {  # of distributions, by the columns of topics
+SCHEMAS = {  # columns of topics by distribution
     "dashing": "id INTEGER PRIMARY KEY, name TEXT, type TEXT",
     "foxy": "id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, "
             "offered_qos_profiles TEXT",
@@ -156,7 +156,7 @@ SCHEMAS = {  # of distributions, by the columns of topics
 
 
 def write_sqlite(path, bag, rows, schema="jazzy", mode="DELETE"):
-    """The open database, of which the second half of the rows is committed last."""
+    """Write rows and return the open database; the second half is committed last."""
     database = sqlite3.connect(path)
     database.execute(f"PRAGMA journal_mode={mode}")
     database.execute("PRAGMA wal_autocheckpoint=0")
@@ -182,17 +182,17 @@ def write_sqlite(path, bag, rows, schema="jazzy", mode="DELETE"):
 
 
 @pytest.mark.parametrize("schema", SCHEMAS)
-def test_sqlite_of_any_distribution_is_read(written, rows, tmp_path, schema):
+def test_sqlite_file_of_any_distribution_is_read(written, rows, tmp_path, schema):
     with Bag(written) as bag:
         write_sqlite(tmp_path / "a?b#c%20.db3", bag, rows, schema).close()
         with Bag(tmp_path / "a?b#c%20.db3") as other:
-            assert (other.topics, other.counts, [*other.raw()]) == (bag.topics, bag.counts, rows)
+            assert (other.topics, other.counts) == (bag.topics, bag.counts)
+            assert [*other.raw_messages()] == rows
 
 
 @pytest.mark.parametrize("shm", [True, False])
-def test_what_is_only_in_the_wal_of_sqlite_is_read_and_nothing_is_written(written, rows, tmp_path,
-                                                                          shm):
-    """A crash leaves such a file with the recorder's preset resilient. The disk is read-only."""
+def test_sqlite_wal_is_read_from_a_read_only_folder(written, rows, tmp_path, shm):
+    """A crash leaves such a file with the recorder's preset resilient."""
     with Bag(written) as bag:
         database = write_sqlite(tmp_path / "a.db3", bag, rows, mode="WAL")
     (tmp_path / "bag").mkdir()
@@ -209,8 +209,8 @@ def test_what_is_only_in_the_wal_of_sqlite_is_read_and_nothing_is_written(writte
     (tmp_path / "bag").chmod(0o755)
 
 
-def changed(written, folder, change) -> Path:
-    """A copy of the bag whose metadata.yaml `change` has changed."""
+def copy_with_metadata(written, folder, change) -> Path:
+    """Return a copy of the bag with changed metadata.yaml."""
     shutil.copytree(written, folder)
     metadata = yaml.safe_load((folder / "metadata.yaml").read_text())
     change(metadata["rosbag2_bagfile_information"])
@@ -218,7 +218,7 @@ def changed(written, folder, change) -> Path:
     return folder
 
 
-def each_topic(info, **values):
+def update_topics(info, **values):
     for topic in info["topics_with_message_count"]:
         topic["topic_metadata"].update(values)
 
@@ -233,15 +233,15 @@ def each_topic(info, **values):
                                             "compression_format", "compression_mode")],
     lambda info: info.update(files=[]),
     lambda info: info.update(topics_with_message_count=[]),
-    lambda info: each_topic(info, offered_qos_profiles=""),
-    lambda info: each_topic(info, offered_qos_profiles=[]),
-    lambda info: each_topic(info, offered_qos_profiles="- history: [\n"),
-    lambda info: each_topic(info, offered_qos_profiles="- infinite"),
-    lambda info: each_topic(info, offered_qos_profiles=[{"deadline": "infinite"}]),
-    lambda info: each_topic(info, type_description_hash="RIHS01_0", serialization_format=""),
+    lambda info: update_topics(info, offered_qos_profiles=""),
+    lambda info: update_topics(info, offered_qos_profiles=[]),
+    lambda info: update_topics(info, offered_qos_profiles="- history: [\n"),
+    lambda info: update_topics(info, offered_qos_profiles="- infinite"),
+    lambda info: update_topics(info, offered_qos_profiles=[{"deadline": "infinite"}]),
+    lambda info: update_topics(info, type_description_hash="RIHS01_0", serialization_format=""),
 ])
-def test_other_texts_in_metadata_change_nothing(written, rows, tmp_path, change):
-    path = changed(written, tmp_path / "bag", change)
+def test_irrelevant_metadata_changes_nothing(written, rows, tmp_path, change):
+    path = copy_with_metadata(written, tmp_path / "bag", change)
     assert message_bytes(path) == rows
     assert len(open_recording(path)) == 3
 
@@ -251,80 +251,79 @@ def test_other_texts_in_metadata_change_nothing(written, rows, tmp_path, change)
     ("- history: keep_last\n  depth: 7\n  reliability: best_effort\n  durability: volatile\n"
      "  deadline: {sec: 2147483647, nsec: 4294967295}\n  lifespan: infinite", "VOLATILE", 7),
 ])
-def test_the_qos_of_metadata_comes_first_in_any_spelling(written, tmp_path, text, durability,
-                                                         depth):
-    path = changed(written, tmp_path / "bag",
-                   lambda info: each_topic(info, offered_qos_profiles=text))
+def test_qos_in_metadata_takes_precedence(written, tmp_path, text, durability, depth):
+    path = copy_with_metadata(written, tmp_path / "bag",
+                              lambda info: update_topics(info, offered_qos_profiles=text))
     with Bag(path) as bag:
         profile, = bag.qos(POINTS)
         assert (profile.durability.name, profile.depth) == (durability, depth)
         assert profile.reliability.name == "BEST_EFFORT"
-    path = changed(written, tmp_path / "other",
-                   lambda info: each_topic(info, offered_qos_profiles="nonsense"))
+    path = copy_with_metadata(written, tmp_path / "other",
+                              lambda info: update_topics(info, offered_qos_profiles="nonsense"))
     with Bag(path) as bag:
         assert bag.qos(EXTRINSICS)[0].durability.name == "TRANSIENT_LOCAL"
 
 
-def counts(info, count):
+def set_counts(info, count):
     for topic in info["topics_with_message_count"]:
         topic["message_count"] = count
 
 
 @pytest.mark.parametrize("change, words", [
-    (lambda info: counts(info, 5), "it says 5 messages on /camera/camera_info, and there are 2.*"
-                                   "and 2 more"),
-    (lambda info: counts(info, -1), "it says -1 messages"),
-    (lambda info: counts(info, "1,5"), "'1,5' for message_count"),
-    (lambda info: counts(info, 2.5), "2.5 for message_count"),
-    (lambda info: each_topic(info, name=3), "a topic 3 of type"),
-    (lambda info: each_topic(info, type=[1]), r"of type \[1\]"),
-    (lambda info: info["duration"].update(nanoseconds=10**8), "a duration of 0.100 s, and it is 0"),
+    (lambda info: set_counts(info, 5),
+     "it declares 5 messages on /camera/camera_info, the files have 2.*and 2 more"),
+    (lambda info: set_counts(info, -1), "it declares -1 messages"),
+    (lambda info: set_counts(info, "1,5"), "'1,5' for message_count"),
+    (lambda info: set_counts(info, 2.5), "2.5 for message_count"),
+    (lambda info: update_topics(info, name=3), "topic 3 has the type"),
+    (lambda info: update_topics(info, type=[1]), r"the type \[1\]"),
+    (lambda info: info["duration"].update(nanoseconds=10**8), "a duration of 0.100 s instead of 0"),
     (lambda info: info["duration"].update(nanoseconds=10**30), "a duration of"),
     (lambda info: info["starting_time"].update(nanoseconds_since_epoch=0), "a start of 0.000 s"),
     (lambda info: info.pop("duration"), "KeyError: 'duration'"),
     (lambda info: info.update(relative_file_paths=["a.mcap", "b.mcap"]),
-     "it names a.mcap, b.mcap, and there is drive.mcap"),
+     "it names a.mcap, b.mcap instead of drive.mcap"),
     (lambda info: info.clear(), "KeyError: 'relative_file_paths'"),
 ])
-def test_a_wrong_metadata_is_said_once_and_the_files_are_read(written, rows, tmp_path, change,
-                                                              words):
-    path = changed(written, tmp_path / "bag", change)
-    with pytest.warns(InputWarning, match=f"bag/metadata.yaml is wrong: .*{words}") as said:
+def test_wrong_metadata_causes_one_warning(written, rows, tmp_path, change, words):
+    path = copy_with_metadata(written, tmp_path / "bag", change)
+    with pytest.warns(InputWarning,
+                      match=f"bag/metadata.yaml does not match the bag: .*{words}") as caught:
         recording = open_recording(path)
         assert [len(frame.load()) for frame in recording] == [
             len(frame.load()) for frame in open_recording(written)]
         recording.frames[2].load()
-    assert len(said) == 1 and "\n" not in str(said[0].message)
+    assert len(caught) == 1 and "\n" not in str(caught[0].message)
     with pytest.warns(InputWarning), Bag(path) as bag:
         assert (bag.start_ns, bag.end_ns) == (rows[0][1], rows[-1][1] + 1)
-        assert [*bag.raw()] == rows
+        assert [*bag.raw_messages()] == rows
 
 
-def test_a_bag_that_another_plugin_compressed_is_named(written, tmp_path):
-    path = changed(written, tmp_path / "bag", lambda info: info.update(
+def test_unsupported_compression_is_reported(written, tmp_path):
+    path = copy_with_metadata(written, tmp_path / "bag", lambda info: info.update(
         compression_mode="FILE", compression_format="lz4"))
-    with pytest.raises(InputError, match=r"compressed by lz4, which is not read; .*ros2 bag"):
+    with pytest.raises(InputError, match=r"compressed by lz4, which is not supported; .*ros2 bag"):
         Bag(path)
 
 
 @pytest.mark.parametrize("text", ["text", "a: [\n", "", "\xff\x00"])
-def test_a_metadata_that_is_none_is_said(written, rows, tmp_path, text):
+def test_unreadable_metadata_causes_a_warning(written, rows, tmp_path, text):
     shutil.copytree(written, tmp_path / "bag")
     (tmp_path / "bag/metadata.yaml").write_text(text, encoding="latin-1")
-    with pytest.warns(InputWarning, match="is not readable"):
+    with pytest.warns(InputWarning, match="cannot be parsed"):
         assert message_bytes(tmp_path / "bag") == rows
 
 
-def pack(data: bytes) -> bytes:
+def compress(data: bytes) -> bytes:
     return zstandard.ZstdCompressor().compress(data)
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("metadata", [True, False])
-def test_files_that_were_compressed_whole_are_read(written, rows, tmp_path, storage, metadata):
+def test_compressed_files_are_read(written, rows, tmp_path, storage, metadata):
     path = copy_bag(written, tmp_path / "bag", storage)
     file, = (file for file in path.iterdir() if file.suffix != ".yaml")
-    (path / f"{file.name}.zstd").write_bytes(pack(file.read_bytes()))
+    (path / f"{file.name}.zstd").write_bytes(compress(file.read_bytes()))
     file.unlink()
     text = (path / "metadata.yaml").read_text()
     (path / "metadata.yaml").write_text(text.replace(file.name, f"{file.name}.zstd"))
@@ -337,15 +336,15 @@ def test_files_that_were_compressed_whole_are_read(written, rows, tmp_path, stor
         message_bytes(path)
 
 
-def test_messages_that_were_compressed_one_by_one_are_read(written, rows, tmp_path):
+def test_compressed_messages_are_read(written, rows, tmp_path):
     with Bag(written) as bag:
         path = write_mcap(tmp_path / "a.mcap", bag,
-                          [(topic, time, pack(data)) for topic, time, data in rows])
+                          [(topic, time, compress(data)) for topic, time, data in rows])
     assert message_bytes(path) == rows
 
 
-def parts_of(folder, stamps):
-    """Storage files of bags, each with a text at its stamps."""
+def write_parts(folder, stamps):
+    """Write bags, each with a text at its stamps, and yield their paths."""
     for i, part in enumerate(stamps):
         with BagWriter(folder / f"part{i}") as bag:
             bag.add_topic("/text", "std_msgs/msg/String")
@@ -358,10 +357,10 @@ def parts_of(folder, stamps):
                                   "any{}.bag"])
 @pytest.mark.parametrize("stamps", [([10, 20], [30, 40], [50]), ([50, 60], [30], [10, 20]),
                                     ([10, 30, 50], [20, 40], [30]), ([], [10], [])])
-def test_files_of_one_drive_are_read_in_order_of_time(tmp_path, kind, stamps):
-    """Without metadata.yaml, as after a crash or from ROS 1; also where they overlap."""
+def test_files_of_a_drive_are_read_in_order_of_time(tmp_path, kind, stamps):
+    """Without metadata.yaml, as after a crash or from ROS 1; the files may overlap in time."""
     (tmp_path / "drive").mkdir()
-    for i, part in enumerate(parts_of(tmp_path, stamps)):
+    for i, part in enumerate(write_parts(tmp_path, stamps)):
         file = tmp_path / "drive" / kind.format(i)
         if file.suffix == ".bag":
             as_ros1(part, file)
@@ -372,15 +371,16 @@ def test_files_of_one_drive_are_read_in_order_of_time(tmp_path, kind, stamps):
             shutil.copy(part / f"{part.name}.mcap", file)
     times = sorted(itertools.chain(*stamps))
     with Bag(tmp_path / "drive") as bag:
-        assert [time for _, time, _ in bag.raw()] == times
+        assert [time for _, time, _ in bag.raw_messages()] == times
         assert bag.counts == {"/text": len(times)}
         assert (bag.start_ns, bag.end_ns) == (times[0], times[-1] + 1)
-        assert [time for _, time, _ in bag.raw(None, 20, 40)] == [t for t in times if 20 <= t < 40]
+        assert [time for _, time, _ in bag.raw_messages(None, 20, 40)] == [
+            time for time in times if 20 <= time < 40]
 
 
-def test_a_folder_of_ros_1_bags_is_one_drive(written, tmp_path):
+def test_folder_of_ros1_bags_is_one_drive(written, tmp_path):
     with Bag(written) as bag:
-        clouds = [*bag.raw({POINTS})]
+        clouds = [*bag.raw_messages({POINTS})]
         for i in range(3):
             with BagWriter(tmp_path / f"part{i}") as part:
                 part.add_topic(POINTS, bag.topics[POINTS])
@@ -403,7 +403,7 @@ def write_clouds(path, topic, kind, messages):
 
 @pytest.mark.parametrize("kind", LIVOX)
 @pytest.mark.parametrize("ros", [1, 2])
-def test_livox_bags_open_with_intensity_and_times_of_points(tmp_path, kind, ros):
+def test_livox_bag_has_intensity_and_point_times(tmp_path, kind, ros):
     points = livox_points(50)
     path = write_clouds(tmp_path / "bag", "/livox/lidar", kind, [
         livox_message(points, kind.partition("/")[0], STAMP + i * 10**8) for i in range(3)])
@@ -423,7 +423,7 @@ def test_livox_bags_open_with_intensity_and_times_of_points(tmp_path, kind, ros)
 
 
 @pytest.mark.parametrize("packing", ["zlib", "zstd"])
-def test_compressed_clouds_of_a_bag_are_read(tmp_path, packing):
+def test_compressed_clouds_are_read(tmp_path, packing):
     points = np.arange(40, dtype=np.float32).view([(name, "<f4") for name in "xyzi"])
     path = write_clouds(tmp_path / "bag", f"/points/{packing}", COMPRESSED,
                         [compressed_message(points, packing)] * 2)
@@ -436,7 +436,7 @@ def test_compressed_clouds_of_a_bag_are_read(tmp_path, packing):
     ("sensor_msgs/msg/LaserScan", "LaserScan on /scan cannot be read"),
     ("velodyne_msgs/msg/VelodyneScan", "VelodyneScan on /scan .*play the bag to velodyne")])
 @pytest.mark.parametrize("points", ["", "/scan"])
-def test_a_bag_with_other_data_of_a_sensor_says_what_to_do(tmp_path, kind, words, points):
+def test_unsupported_sensor_data_is_reported_with_remedy(tmp_path, kind, words, points):
     message = b"\0\1\0\0" + bytes(60)
     if kind == COMPRESSED:
         message = encode(compressed_message(np.zeros(1, [("x", "<f4")]), "draco"))

@@ -1,4 +1,4 @@
-"""Files of clouds as other programs write them, and formats that are refused by name."""
+"""Point cloud files of other programs, and formats that are not supported."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def text(columns=CLOUD, form="{:.6f}"):
 
 
 def padded(count0):
-    """Records with a field of no numbers between those with some."""
+    """Return a PCD file with padding and a field without numbers."""
     kind = np.dtype([("xyz", "<f4", 3), ("pad", "V4"), ("intensity", "<f4"), ("end", "V2")])
     made = np.zeros(len(CLOUD), kind)
     made["xyz"], made["intensity"] = CLOUD[:, :3], CLOUD[:, 3]
@@ -74,7 +74,7 @@ def test_pcd_variants_are_read(tmp_path, case):
     assert "ring" not in read_points(tmp_path / name).dtype.names
 
 
-def test_whole_numbers_with_a_point_keep_their_integer_type(tmp_path):
+def test_integers_with_decimal_point_keep_their_type(tmp_path):
     whole = np.column_stack([CLOUD[:, :3], np.arange(len(CLOUD))])
     path = write(tmp_path / "one.pcd", header(types="F F F U", sizes="4 4 4 1",
                                               data="ascii") + text(whole))
@@ -99,7 +99,7 @@ def ply(form, names=("x", "y", "z", "intensity"), kinds=("f4",) * 4, before="", 
     (("x", "y", "z", "intensity"), ("f4", "f4", "f4", "f4")),
     (("X", "Y", "Z", "scalar_Intensity"), ("f8", "f8", "f8", "f4")),
     (("x", "y", "z", "reflectance"), ("f4", "f8", "f4", "f8"))])
-def test_ply_files_of_every_form_are_read(tmp_path, form, names, kinds):
+def test_ply_formats_are_read(tmp_path, form, names, kinds):
     frame = load(write(tmp_path / "one.PLY", ply(form, names, kinds)))
     np.testing.assert_allclose(frame.xyz, CLOUD[:, :3], atol=1e-6)
     np.testing.assert_allclose(frame.intensity, CLOUD[:, 3], atol=1e-6)
@@ -113,15 +113,15 @@ def test_ply_elements_before_the_vertices_are_skipped(tmp_path):
 
 
 @pytest.mark.parametrize("content, words", [
-    (b"", "does not begin with ply"), (b"ply\nformat ascii 1.0\n", "no line end_header"),
-    (b"ply\nformat ascii 1.0\nend_header\n", "no element vertex"),
-    (b"ply\nelement vertex 1\nproperty float x\nend_header\n1\n", "no line format"),
-    (b"ply\nformat odd 1.0\nend_header\n", "odd"), (ply("ascii")[:900], "it was cut"),
-    (ply("binary_big_endian")[:900], "it was cut"),
+    (b"", "does not start with ply"), (b"ply\nformat ascii 1.0\n", "end_header is missing"),
+    (b"ply\nformat ascii 1.0\nend_header\n", "element vertex is missing"),
+    (b"ply\nelement vertex 1\nproperty float x\nend_header\n1\n", "line format is missing"),
+    (b"ply\nformat odd 1.0\nend_header\n", "odd"), (ply("ascii")[:900], "it is truncated"),
+    (ply("binary_big_endian")[:900], "it is truncated"),
     (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1\n",
-     "x of its vertex elements is a list"),
+     "x of vertex elements is a list"),
     (ply("ascii", ("x", "y", "w", "v")), "has no field z")])
-def test_a_broken_ply_file_is_named(tmp_path, content, words):
+def test_invalid_ply_file_is_reported(tmp_path, content, words):
     write(tmp_path / "one.ply", content)
     with pytest.raises(InputError, match=rf"one\.ply .*{words}") as error:
         load(tmp_path)
@@ -132,7 +132,7 @@ def test_a_broken_ply_file_is_named(tmp_path, content, words):
     (CLOUD, True), (CLOUD[:, :3], False), (CLOUD.astype(np.float64), True),
     (np.column_stack([CLOUD, CLOUD[:, 0]]), True), (np.asfortranarray(CLOUD), True),
     (CLOUD.view([(name, "<f4") for name in ("X", "y", "z", "Intensity")]).ravel(), True)])
-def test_npy_files_are_clouds(tmp_path, array, intensity):
+def test_npy_files_are_read(tmp_path, array, intensity):
     np.save(tmp_path / "one.npy", array)
     frame = load(tmp_path)
     assert np.array_equal(frame.xyz, CLOUD[:, :3])
@@ -146,20 +146,20 @@ def test_npy_files_are_clouds(tmp_path, array, intensity):
     lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(60,(60,"))),
     lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(9**99,"))),
     lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(60, 5)")))])
-def test_a_broken_npy_file_is_named(tmp_path, make):
+def test_invalid_npy_file_is_reported(tmp_path, make):
     make(tmp_path / "one.npy")
     with pytest.raises(InputError, match=r"one\.npy .*(save it again|expected \(N, 3\))") as error:
         load(tmp_path)
     assert "\n" not in str(error.value)
 
 
-def test_a_cloud_in_map_coordinates_is_named_with_the_remedy(tmp_path):
+def test_map_coordinates_are_reported_with_remedy(tmp_path):
     far = CLOUD.astype(np.float64) + [513_000, 5_404_000, 300, 0]
     np.save(tmp_path / "one.npy", far)
     with pytest.raises(InputError, match=r"one\.npy: all points are beyond 100 km.*subtract an "
-                                         "offset, such as 513000 5404000 from x y"):
+                                         "offset, such as 513000 5404000, from x y"):
         load(tmp_path)
-    far[0, :3] = 1, 2, 3  # a single one is near: the others are broken returns
+    far[0, :3] = 1, 2, 3  # with one point in range, the others are invalid returns
     np.save(tmp_path / "one.npy", far)
     assert len(load(tmp_path)) == 1
     np.save(tmp_path / "one.npy", np.full((5, 3), np.nan))
@@ -170,23 +170,23 @@ FIRST = 1_741_286_117
 
 
 @pytest.mark.parametrize("names, expected", [
-    # SECONDS.NANOSECONDS without leading zeros, as pointcloud_to_pcd wrote
+    # SECONDS.NANOSECONDS without leading zeros, by old versions of pointcloud_to_pcd
     ([f"{FIRST}.{i * 10**8 + 11_149_430}" for i in range(10)],
      [i * 10**8 + 11_149_430 for i in range(10)]),
     ([f"{FIRST}.{i * 10**8 + 7}" for i in range(3)], [i * 10**8 + 7 for i in range(3)]),
     ([f"{FIRST}.5000", f"{FIRST}.100005000"], [5000, 100_005_000]),
-    # decimal fractions: padded, and of floats
+    # decimal fractions, padded or as printed floats
     ([f"{FIRST}.{i * 10**8 + 11_149_430:09}" for i in range(10)],
      [i * 10**8 + 11_149_430 for i in range(10)]),
     ([f"{FIRST}.1", f"{FIRST}.2", f"{FIRST}.3000001"], [10**8, 2 * 10**8, 300_000_100]),
     ([f"{FIRST}.05", f"{FIRST}.123456789"], [5 * 10**7, 123_456_789]),
     ([f"{FIRST}.1", f"{FIRST}.2", f"{FIRST}.300000001"], [10**8, 2 * 10**8, 300_000_001])])
-def test_times_in_names_may_lack_leading_zeros(tmp_path, names, expected):
+def test_times_in_file_names_may_lack_leading_zeros(tmp_path, names, expected):
     for name in names:
         write(tmp_path / f"{name}.BIN", CLOUD.tobytes())
     recording = open_recording(tmp_path)
     assert [f.stamp_ns - FIRST * 10**9 for f in recording] == sorted(expected)
-    assert [f.name for f in recording] == names and recording.timed
+    assert [f.name for f in recording] == names and recording.has_times
     assert open_clouds(tmp_path).stamps_ns.tolist() == [f.stamp_ns for f in recording]
 
 
@@ -197,10 +197,10 @@ def test_times_in_names_may_lack_leading_zeros(tmp_path, names, expected):
     ("val/log/sensors/lidar/1.feather", r"format Argoverse 2 .*av2"),
     ("drive.pcap", r"sensor packets .*driver"), ("drive.pcapng", "sensor packets"),
     ("drive.lvx2", "Livox Viewer.*lvx_to_rosbag"), ("drive.osf", "ouster-cli source")])
-def test_other_formats_are_refused_by_name_with_a_converter(tmp_path, file, words):
+def test_unsupported_formats_are_reported_with_a_converter(tmp_path, file, words):
     path = write(tmp_path / file, b"LASF")
-    for place in (path, tmp_path):
+    for given in (path, tmp_path):
         for opener in (open_recording, open_clouds):
             with pytest.raises(InputError, match=words) as error:
-                opener(place)
+                opener(given)
             assert "\n" not in str(error.value) and path.name in str(error.value)

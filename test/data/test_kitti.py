@@ -1,4 +1,4 @@
-"""KITTI folders: scans, calibrations and time stamps of every layout are read in full."""
+"""KITTI folders: scans, calibrations and stamps of every layout."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lidar_perception.data.open import open_recording
 
 
 @pytest.mark.parametrize("layout, count", [("object", 2), ("tracking", 5), ("raw", 3)])
-def test_every_scan_is_read_as_it_is_in_the_file(tmp_path, layout, count):
+def test_scans_are_read_unchanged(tmp_path, layout, count):
     frames = open_recording(LAYOUTS[layout](tmp_path)).frames
     assert len(frames) == count
     for frame in frames:
@@ -35,7 +35,7 @@ def test_every_scan_is_read_as_it_is_in_the_file(tmp_path, layout, count):
 
 
 @each_layout
-def test_the_calibration_is_the_product_of_its_matrices(tmp_path, layout):
+def test_calibration_is_the_product_of_its_matrices(tmp_path, layout):
     for frame in open_recording(LAYOUTS[layout](tmp_path)):
         calibration = frame.calibration()
         np.testing.assert_allclose(calibration.lidar_to_camera, LIDAR_TO_CAMERA, atol=1e-12)
@@ -44,7 +44,7 @@ def test_the_calibration_is_the_product_of_its_matrices(tmp_path, layout):
 
 
 @each_layout
-def test_frames_have_ascending_stamps_and_names_of_their_own(tmp_path, layout):
+def test_frames_have_ascending_stamps_and_unique_names(tmp_path, layout):
     frames = open_recording(LAYOUTS[layout](tmp_path)).frames
     stamps = [f.stamp_ns for f in frames]
     assert stamps == sorted({*stamps}) and len({f.name for f in frames}) == len(frames)
@@ -60,13 +60,13 @@ def test_object_and_tracking_frames_come_at_10_hz(tmp_path):
     assert second[0].stamp_ns - first[-1].stamp_ns > 10**9
 
 
-def test_a_frame_that_is_missing_leaves_its_time_empty(tmp_path):
+def test_missing_frame_leaves_a_gap_in_time(tmp_path):
     root = tracking_folder(tmp_path)
     (root / "training/velodyne/0000/000001.bin").unlink()
     assert [f.stamp_ns - START_NS for f in open_recording(root).frames[:2]] == [0, 2 * 10**8]
 
 
-def test_raw_stamps_are_read_to_the_nanosecond(tmp_path):
+def test_raw_stamps_have_nanosecond_resolution(tmp_path):
     second = 1317042145 * 10**9  # date -u -d '2011-09-26 13:02:25' +%s
     assert [f.stamp_ns - second for f in open_recording(raw_folder(tmp_path))] == [
         594360375, 700000000, 1000000001]
@@ -74,7 +74,7 @@ def test_raw_stamps_are_read_to_the_nanosecond(tmp_path):
 
 @pytest.mark.parametrize("inner", ["", "training", "2011_09_26",
                                    "2011_09_26/2011_09_26_drive_0001_sync"])
-def test_a_folder_may_be_given_from_outside_or_inside(tmp_path, inner):
+def test_outer_and_inner_folders_are_the_same_recording(tmp_path, inner):
     folders = {layout: make(tmp_path / layout) for layout, make in LAYOUTS.items()}
     for root in folders.values():
         if (root / inner).is_dir():
@@ -82,14 +82,14 @@ def test_a_folder_may_be_given_from_outside_or_inside(tmp_path, inner):
                 f.points for f in open_recording(root)]
 
 
-def test_the_full_scan_wins_over_the_reduced_one(tmp_path):
+def test_full_scan_is_preferred_to_reduced_one(tmp_path):
     root = object_folder(tmp_path)
     for i in (1, 2):
         write(root / f"training/velodyne_reduced/{i:06}.bin", scene(i)[:50].tobytes())
     assert [len(f.load()) for f in open_recording(root)] == [len(scene()), len(scene()), 50]
 
 
-def test_a_scan_keeps_only_returns_that_can_be_used(tmp_path):
+def test_unusable_returns_are_dropped(tmp_path):
     root = object_folder(tmp_path)
     cloud = np.array([[1, 2, 3, 0.5], [0, 0, 0, 0.1], [np.nan, 1, 1, 0.2], [4, 5, 6, 0.7]], "f4")
     write(root / "training/velodyne/000000.bin", cloud.tobytes())
@@ -99,11 +99,11 @@ def test_a_scan_keeps_only_returns_that_can_be_used(tmp_path):
     assert read_velodyne(frame.points).tobytes() == cloud.tobytes()
 
 
-def test_an_empty_scan_is_a_scan(tmp_path):
+def test_empty_scan_is_read(tmp_path):
     assert read_velodyne(write(tmp_path / "empty.bin", b"")).shape == (0, 4)
 
 
-def test_the_image_says_its_size(tmp_path):
+def test_image_size_is_that_of_the_file(tmp_path):
     root = object_folder(tmp_path)
     write(root / "training/image_2/000001.png", png_header(640, 480))
     sizes = [(f.calibration().width, f.calibration().height) for f in open_recording(root)]
@@ -111,20 +111,20 @@ def test_the_image_says_its_size(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89PNG", b"JFIF" * 10])
-def test_what_is_no_png_says_nothing_about_the_size(tmp_path, content):
+def test_invalid_png_does_not_change_the_image_size(tmp_path, content):
     path, image = write(tmp_path / "c.txt", calibration_text()), write(tmp_path / "i.png", content)
     calibration = read_calibration(path, image)
     assert (calibration.width, calibration.height) == (1242, 375)
 
 
 @pytest.mark.parametrize("focal, size", [*IMAGE_SIZES.items(), (1000.0, (1242, 375))])
-def test_the_focal_length_says_the_size_where_there_is_no_image(tmp_path, focal, size):
+def test_image_size_follows_from_focal_length_without_image(tmp_path, focal, size):
     text = calibration_text().replace("721.5377", str(focal))
     calibration = read_calibration(write(tmp_path / "c.txt", text))
     assert (calibration.width, calibration.height) == size
 
 
-def test_the_pose_is_the_inverse_of_lidar_to_camera():
+def test_camera_pose_is_the_inverse_of_lidar_to_camera():
     camera, direct = CALIBRATION.camera(), INTRINSICS @ LIDAR_TO_CAMERA
     np.testing.assert_allclose(camera.projection, direct, atol=1e-9)
     assert (camera.width, camera.height) == (1242, 375)

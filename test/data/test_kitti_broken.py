@@ -1,4 +1,4 @@
-"""KITTI folders with something broken or missing: it is named, and the other frames go on."""
+"""KITTI folders with invalid or missing files: they are reported, other frames are not affected."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from samples import LABELS, calibration_text, object_folder, write
 from lidar_perception.data.open import open_recording
 from lidar_perception.types import InputError
 
-PARTS = {  # broken file -> its new content (None: removed), and words of the message
+INVALID_FILES = {  # invalid file: its content (None: removed) and words of the error
     "velodyne/000000.bin": [(b"123", "multiple of 16")],
     "calib/000000.txt": [
         (None, "cannot read"), (b"\xff\xfe\x00", "cannot read"), ("", "no P2"),
@@ -21,21 +21,21 @@ PARTS = {  # broken file -> its new content (None: removed), and words of the me
         (calibration_text().replace("P2: 721.5377", "P2: nan"), "no P2 of 12 finite numbers"),
     ],
     "label_2/000000.txt": [
-        (LABELS + "Car 0 0 0\n", ":4 is no KITTI label"),
-        (LABELS.replace("1.52", "tall"), ":2 is no KITTI label"),
+        (LABELS + "Car 0 0 0\n", ":4 is not a KITTI label"),
+        (LABELS.replace("1.52", "tall"), ":2 is not a KITTI label"),
         (b"\xff\xfe\x00", "cannot read"),
     ],
 }
 
 
 def read(frame):
-    """All that a frame has."""
+    """Read everything that a frame has."""
     return frame.load(), frame.truth(), frame.calibration()
 
 
 @pytest.mark.parametrize("file, content, words", [
-    (file, content, words) for file, cases in PARTS.items() for content, words in cases])
-def test_a_broken_file_is_named_and_the_other_frames_go_on(tmp_path, file, content, words):
+    (file, content, words) for file, cases in INVALID_FILES.items() for content, words in cases])
+def test_invalid_file_is_reported_for_its_frame_only(tmp_path, file, content, words):
     root = object_folder(tmp_path)
     path = root / "training" / file
     path.unlink()
@@ -52,10 +52,10 @@ def test_a_broken_file_is_named_and_the_other_frames_go_on(tmp_path, file, conte
 
 @pytest.mark.parametrize("layout, file, content, words", [
     ("tracking", "training/calib/0000.txt", "", "no P2"),
-    ("tracking", "training/label_02/0000.txt", "0 1 Car", ":1 is no KITTI label"),
+    ("tracking", "training/label_02/0000.txt", "0 1 Car", ":1 is not a KITTI label"),
     ("tracking", "training/label_02/0000.txt", "zero " + TRACKING_LABELS[2:],
-     ":1 is no tracking label"),
-    ("tracking", "training/label_02/0000.txt", "\n7\n", ":2 is no tracking label"),
+     ":1 is not a tracking label"),
+    ("tracking", "training/label_02/0000.txt", "\n7\n", ":2 is not a tracking label"),
     ("raw", "2011_09_26/calib_cam_to_cam.txt", "", "no S_rect_02"),
     ("raw", "2011_09_26/calib_velo_to_cam.txt", "", "no R of 9 finite numbers"),
     ("raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml", "<cut", "cannot read"),
@@ -63,7 +63,7 @@ def test_a_broken_file_is_named_and_the_other_frames_go_on(tmp_path, file, conte
     ("raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml",
      TRACKLETS.replace("<h>1.8</h>", "<h>tall</h>"), "cannot read"),
 ])
-def test_a_broken_file_of_a_sequence_is_named(tmp_path, layout, file, content, words):
+def test_invalid_file_of_a_sequence_is_reported(tmp_path, layout, file, content, words):
     root = LAYOUTS[layout](tmp_path)
     write(root / file, content)
     with pytest.raises(InputError) as error:
@@ -72,7 +72,7 @@ def test_a_broken_file_of_a_sequence_is_named(tmp_path, layout, file, content, w
 
 
 @pytest.mark.parametrize("text", [None, "yesterday\n" * 3, "2011-09-26 13:02:25.5\n"])
-def test_broken_time_stamps_are_named(tmp_path, text):
+def test_invalid_time_stamps_are_reported(tmp_path, text):
     path = next(raw_folder(tmp_path).rglob("timestamps.txt"))
     path.unlink()
     if text is not None:
@@ -84,7 +84,7 @@ def test_broken_time_stamps_are_named(tmp_path, text):
 @pytest.mark.parametrize("layout, scan", [
     ("tracking", "training/velodyne/0000/notes.bin"),
     ("raw", "2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data/notes.bin")])
-def test_a_scan_whose_name_is_no_number_is_named(tmp_path, layout, scan):
+def test_scan_without_number_is_reported(tmp_path, layout, scan):
     root = LAYOUTS[layout](tmp_path)
     write(root / scan, b"")
     with pytest.raises(InputError, match=r"notes\.bin"):

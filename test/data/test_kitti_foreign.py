@@ -1,4 +1,4 @@
-"""KITTI folders and labels as other tools write them, and with parts missing."""
+"""KITTI folders and labels of other tools, and with missing parts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from kitti_samples import TRACKLETS, raw_folder, tracking_folder
 from samples import LABELS, object_folder, scene, write
 
-from lidar_perception.data.kitti.labels import parse, read_tracklets
+from lidar_perception.data.kitti.labels import parse_label, read_tracklets
 from lidar_perception.data.open import open_recording
 from lidar_perception.types import CLASSES, InputError, class_ids
 
@@ -19,49 +19,49 @@ SPELLINGS = {"car": "Car", "CAR": "Car", "dontcare": "DontCare", "Person sitting
 
 
 @pytest.mark.parametrize("text", SPELLINGS)
-def test_class_names_are_matched_in_any_spelling(text):
+def test_class_names_are_recognised_in_any_spelling(text):
     name = SPELLINGS[text]
-    assert parse(CAR.replace("Car", text))["class"] == name
-    assert parse(CAR.replace("Car", text) + " 0.9")["score"] == 0.9
+    assert parse_label(CAR.replace("Car", text))["class"] == name
+    assert parse_label(CAR.replace("Car", text) + " 0.9")["score"] == 0.9
     if text != "Person":  # a name of the tracking benchmark only
         assert [CLASSES[i] for i in class_ids([text])] == [name if name in CLASSES else "Misc"]
     if name in CLASSES:
-        assert parse(CAR.replace("Car", text), known_only=True)
+        assert parse_label(CAR.replace("Car", text), known_only=True)
     else:
         with pytest.raises(InputError, match=f"unknown class '{text}'"):
-            parse(CAR.replace("Car", text), known_only=True)
+            parse_label(CAR.replace("Car", text), known_only=True)
 
 
-def windows(text):
-    """As editors of Windows save it, with blanks at the ends of lines."""
+def encode_for_windows(text):
+    """Return a text as Windows editors save it, with spaces at the ends of lines."""
     return b"\xef\xbb\xbf" + text.replace("\n", " \t\r\n").encode() + b"\r\n\r\n"
 
 
 @pytest.mark.parametrize("make", [object_folder, tracking_folder, raw_folder])
-def test_texts_with_byte_order_mark_crlf_and_blanks_are_read(tmp_path, make):
+def test_files_of_windows_editors_are_read(tmp_path, make):
     expected = list(open_recording(make(tmp_path / "plain")))
     root = make(tmp_path / "windows")
     for path in (*root.rglob("*.txt"), *root.rglob("*.xml")):
-        path.write_bytes(windows(path.read_text()))
-    for frame, same in zip(open_recording(root), expected, strict=True):
-        assert (frame.name, frame.stamp_ns) == (same.name, same.stamp_ns)
-        assert frame.calibration().equals(same.calibration())
-        truth, other = frame.truth(), same.truth()
+        path.write_bytes(encode_for_windows(path.read_text()))
+    for frame, original in zip(open_recording(root), expected, strict=True):
+        assert (frame.name, frame.stamp_ns) == (original.name, original.stamp_ns)
+        assert frame.calibration().equals(original.calibration())
+        truth, other = frame.truth(), original.truth()
         assert truth is other is None or (truth.labels == other.labels and np.array_equal(
             truth.boxes, other.boxes) and truth.notes == other.notes)
-    split = write(tmp_path / "split.txt", windows(f"{expected[-1].name}\n"))
+    split = write(tmp_path / "split.txt", encode_for_windows(f"{expected[-1].name}\n"))
     assert [f.name for f in open_recording(root, split=split)] == [expected[-1].name]
 
 
-def test_labels_of_missing_scans_of_a_tracking_folder_are_counted(tmp_path):
+def test_tracking_labels_without_scan_are_listed(tmp_path):
     root = tracking_folder(tmp_path)
     write(root / "training/label_02/0003.txt", "7 1 " + CAR + "\n7 2 " + CAR + "\n")
     (root / "training/velodyne/0000/000002.bin").unlink()
     recording = open_recording(root)
-    assert [name for name, _ in recording.lost] == ["0000/000002", "0003/000007"]
+    assert [name for name, _ in recording.missing_scans] == ["0000/000002", "0003/000007"]
     assert all("has no scan; download it again" in reason and str(root) in reason
-               for _, reason in recording.lost)
-    assert open_recording(root, scans=False).lost == ()
+               for _, reason in recording.missing_scans)
+    assert open_recording(root, scans=False).missing_scans == ()
 
 
 # raw drives
@@ -82,7 +82,7 @@ def raw_scans(root, numbers, lines):
 
 
 @pytest.mark.parametrize("missing", [(3, 4, 5, 6), (0,), (0, 1, 8), (2, 5)])
-def test_blank_time_stamps_stand_for_missing_scans(tmp_path, missing):
+def test_blank_time_stamps_belong_to_missing_scans(tmp_path, missing):
     numbers = [i for i in range(9) if i not in missing]
     blank = ["" if i in missing else line for i, line in enumerate(STAMPS)]
     for lines in (blank, STAMPS, [line for line in blank if line]):
@@ -91,14 +91,15 @@ def test_blank_time_stamps_stand_for_missing_scans(tmp_path, missing):
         assert [frame.stamp_ns for frame in recording] == [START_NS + i * 10**8 for i in numbers]
 
 
-def test_a_scan_without_a_time_stamp_is_named(tmp_path):
+def test_scan_without_time_stamp_is_reported(tmp_path):
     for lines in (STAMPS[:4] + [""] + STAMPS[5:], STAMPS[:3]):
-        with pytest.raises(InputError, match=r"timestamps.txt has \d lines, and none for scan 4"):
+        with pytest.raises(InputError, match=r"timestamps.txt has \d lines, but none for scan 4"):
             open_recording(raw_scans(tmp_path, (0, 1, 4, 5), lines))
 
 
-def exported(root, names=("0000000000", "0000000001", "0000000002"), frame_list=""):
-    """As CVAT and Datumaro export: .pcd files and the user's class names, nothing else."""
+def write_exported_drive(root, names=("0000000000", "0000000001", "0000000002"), frame_list=""):
+    """Write a drive as CVAT and Datumaro export it: .pcd files and user-defined class names
+    only."""
     for i, name in enumerate(names):
         cloud = scene(i)[:40]
         write(root / f"velodyne_points/data/{name}.pcd",
@@ -113,23 +114,22 @@ def exported(root, names=("0000000000", "0000000001", "0000000002"), frame_list=
 @pytest.mark.parametrize("names, frame_list, indices", [
     (("0000000000", "0000000001", "0000000002"), "", [0, 1, 2]),
     (("a", "b", "c"), "# made by a tool\n2 a\n1 sub/c\n\n0 b\n", [0, 1, 2])])
-def test_exported_drives_with_pcd_scans_open_with_their_labels(tmp_path, names, frame_list,
-                                                               indices):
-    recording = open_recording(exported(tmp_path, names, frame_list))
+def test_exported_drive_with_pcd_scans_has_labels(tmp_path, names, frame_list, indices):
+    recording = open_recording(write_exported_drive(tmp_path, names, frame_list))
     assert str(recording).endswith("KITTI raw drives, 3 frames, labelled boxes")
-    assert not recording.timed and [frame.index for frame in recording] == indices
+    assert not recording.has_times and [frame.index for frame in recording] == indices
     assert [len(frame.load()) for frame in recording] == [40] * 3
     assert [frame.truth().labels for frame in recording] == [
         [], ["Pedestrian"], ["Pedestrian", "Person_sitting"]]
     assert all(frame.calibration() is None for frame in recording)
 
 
-def test_a_scan_that_the_list_of_frames_lacks_is_named(tmp_path):
-    root = exported(tmp_path, ("a", "b", "c"), "0 a\n1 b\n")
+def test_scan_missing_in_frame_list_is_reported(tmp_path):
+    root = write_exported_drive(tmp_path, ("a", "b", "c"), "0 a\n1 b\n")
     with pytest.raises(InputError, match=r"frame_list.txt does not name c\.pcd"):
         open_recording(root)
     write(root / "frame_list.txt", "first a\n")
-    with pytest.raises(InputError, match=r"frame_list.txt has a line that is not NUMBER NAME"):
+    with pytest.raises(InputError, match=r"frame_list.txt has a line other than NUMBER NAME"):
         open_recording(root)
 
 
@@ -149,12 +149,12 @@ def test_tracklets_of_other_tools_keep_their_class_names(tmp_path):
         tracklet("Van", [(5, "")], size=(0, 1, 2)))) + "</tracklets></boost_serialization>")
     first, second = read_tracklets(path).values()
     assert first.labels == ["Car", "Car"] and [name for name, _ in first.notes] == ["Van"]
-    assert second.labels == ["Car", "Misc"]  # the second car is not there: Datumaro fills gaps
+    assert second.labels == ["Car", "Misc"]  # the second car only fills a gap
     assert second.extras[1] == {"track_id": 1, "occluded": 0, "truncated": 2.0, "class_name": "bus"}
     assert second.boxes[:, 0].tolist() == [11, 9]
 
 
-def test_an_unknown_class_of_an_object_file_keeps_its_name(tmp_path):
+def test_unknown_object_class_keeps_its_name(tmp_path):
     root = object_folder(tmp_path, LABELS + CAR.replace("Car", "e-scooter") + "\n")
     truth = open_recording(root).frames[0].truth()
     assert truth.labels[-1] == "Misc" and truth.extras[-1]["class_name"] == "e-scooter"

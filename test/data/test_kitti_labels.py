@@ -1,4 +1,4 @@
-"""KITTI labels: as text, as boxes and as markers they say the same, in every layout."""
+"""KITTI labels as text, boxes and markers."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from kitti_samples import (
     LAYOUTS,
     each_layout,
-    over_the_wire,
+    format_truth,
     raw_folder,
     same,
-    text_of,
+    through_markers,
     tracking_folder,
 )
 from samples import AXES, LABELS, LIDAR_TO_CAMERA, object_folder, write
@@ -19,7 +19,7 @@ from samples import AXES, LABELS, LIDAR_TO_CAMERA, object_folder, write
 from lidar_perception.data.kitti.calibration import read_calibration
 from lidar_perception.data.kitti.labels import (
     format_label,
-    parse,
+    parse_label,
     read_object_labels,
     read_tracking_labels,
     to_ground_truth,
@@ -48,17 +48,17 @@ def label_lines(draw) -> str:
 
 
 @given(st.lists(label_lines(), max_size=6))
-def test_labels_through_truth_and_markers_come_back_as_the_same_text(lines):
-    truth = to_ground_truth([parse(line) for line in lines], LIDAR_TO_CAMERA)
-    received = over_the_wire(truth)
+def test_labels_survive_conversion_to_truth_and_markers(lines):
+    truth = to_ground_truth([parse_label(line) for line in lines], LIDAR_TO_CAMERA)
+    received = through_markers(truth)
     assert same(received, truth)
     expected = sorted(lines, key=lambda line: line.startswith("DontCare"))  # notes come last
-    assert text_of(truth) == text_of(received) == expected
+    assert format_truth(truth) == format_truth(received) == expected
 
 
 @given(label_lines().filter(lambda line: not line.startswith(("DontCare", "Unicorn"))))
-def test_a_label_can_be_computed_from_its_box(line):
-    label = parse(line)
+def test_label_can_be_computed_from_its_box(line):
+    label = parse_label(line)
     truth = to_ground_truth([label], LIDAR_TO_CAMERA)
     again, = to_labels(GroundTruth.of(truth.boxes, truth.class_ids), LIDAR_TO_CAMERA)
     assert again["class"] == label["class"]
@@ -71,9 +71,9 @@ def test_a_label_can_be_computed_from_its_box(line):
 
 
 @given(label_lines().filter(lambda line: not line.startswith("DontCare")))
-def test_boxes_have_the_corners_of_the_development_kit(line):
-    """computeBox3D.m, with a camera that is level."""
-    label = parse(line)
+def test_box_corners_are_those_of_the_development_kit(line):
+    """Compare with computeBox3D.m, for a level camera."""
+    label = parse_label(line)
     level = np.eye(4)
     level[:3] = np.column_stack([AXES, [0.1, -0.2, -0.3]])
     h, w, length = label["dimensions"]
@@ -88,25 +88,25 @@ def test_boxes_have_the_corners_of_the_development_kit(line):
     assert distance.min(axis=0).max() < 1e-9 and distance.min(axis=1).max() < 1e-9
 
 
-def test_object_labels_are_those_of_the_frame(tmp_path):
+def test_object_labels_belong_to_their_frame(tmp_path):
     root = object_folder(tmp_path)
     write(root / "training/label_2/000001.txt", "")
     first, second = open_recording(root).frames
-    assert text_of(first.truth()) == LABELS.splitlines()
+    assert format_truth(first.truth()) == LABELS.splitlines()
     assert len(second.truth()) == 0 and second.truth().notes == ()
 
 
-def test_tracking_labels_are_those_of_the_sequence_and_frame(tmp_path):
+def test_tracking_labels_belong_to_sequence_and_frame(tmp_path):
     first, second, third, *other = [f.truth() for f in open_recording(tracking_folder(tmp_path))]
     assert first.labels == ["Pedestrian"] and first.extras[0]["track_id"] == 3
     assert [name for name, _ in first.notes] == ["DontCare"]
     assert len(second) == 0
     assert third.labels == ["Person_sitting"] and third.extras[0]["track_id"] == 4
     assert other == [None, None]  # this sequence has no label file
-    assert all(same(over_the_wire(t), t) for t in (first, second, third))
+    assert all(same(through_markers(t), t) for t in (first, second, third))
 
 
-def test_tracklets_are_boxes_on_their_bottom_face(tmp_path):
+def test_tracklets_are_placed_by_their_bottom_face(tmp_path):
     first, second, third = [f.truth() for f in open_recording(raw_folder(tmp_path))]
     assert len(first) == 0
     np.testing.assert_allclose(second.boxes, [[8, -1, -0.8, 0.9, 0.5, 1.8, 0.5]])
@@ -115,43 +115,43 @@ def test_tracklets_are_boxes_on_their_bottom_face(tmp_path):
     np.testing.assert_allclose(third.boxes, [[9, -1, -0.8, 0.9, 0.5, 1.8, 0.6],
                                              [5, 2, -1.0, 0.8, 0.6, 1.2, -3]])
     assert [e["track_id"] for e in third.extras] == [0, 1]
-    assert same(over_the_wire(third), third)
+    assert same(through_markers(third), third)
 
 
 @each_layout
-def test_folders_without_labels_have_none(tmp_path, layout):
+def test_folder_without_labels_has_no_truth(tmp_path, layout):
     root = LAYOUTS[layout](tmp_path)
     for path in [*root.rglob("label_*/*.txt"), *root.rglob("tracklet_labels.xml")]:
         path.unlink()
     assert [f.truth() for f in open_recording(root)] == [None] * len(open_recording(root))
 
 
-def test_real_object_labels_come_back_as_the_same_text(data):
+def test_real_object_labels_survive_conversion(data):
     folder = data / "kitti_object/training"
     paths = sorted(folder.glob("label_2/*.txt"))
     assert paths
     for path in paths:
         to_camera = read_calibration(folder / "calib" / path.name).lidar_to_camera
-        truth = over_the_wire(read_object_labels(path, to_camera))
+        truth = through_markers(read_object_labels(path, to_camera))
         lines = [line for line in path.read_text().splitlines() if line]
         assert sorted(format_label(x) for x in to_labels(truth, to_camera)) == sorted(lines), path
 
 
-def test_real_tracking_labels_come_back_as_the_same_numbers(data):
+def test_real_tracking_labels_survive_conversion(data):
     folder = data / "kitti_tracking/training"
     to_camera = read_calibration(folder / "calib/0000.txt").lidar_to_camera
     path = folder / "label_02/0000.txt"
-    back = [[frame, x["track_id"], x["class"], x["truncated"], x["occluded"], x["alpha"],
-             *x["bbox"], *x["dimensions"], *x["location"], x["rotation_y"]]
-            for frame, truth in read_tracking_labels(path, to_camera).items()
-            for x in to_labels(over_the_wire(truth), to_camera)]
+    converted = [[frame, x["track_id"], x["class"], x["truncated"], x["occluded"], x["alpha"],
+                  *x["bbox"], *x["dimensions"], *x["location"], x["rotation_y"]]
+                 for frame, truth in read_tracking_labels(path, to_camera).items()
+                 for x in to_labels(through_markers(truth), to_camera)]
     lines = [line.split() for line in path.read_text().splitlines()]
-    read = [[int(f), int(t), name, *map(float, rest)] for f, t, name, *rest in lines]
-    assert sorted(back, key=str) == sorted(
-        [[*row[:4], int(row[4]), *row[5:]] for row in read], key=str)
+    expected = [[int(f), int(t), name, *map(float, rest)] for f, t, name, *rest in lines]
+    assert sorted(converted, key=str) == sorted(
+        [[*row[:4], int(row[4]), *row[5:]] for row in expected], key=str)
 
 
-def test_real_labels_computed_from_their_boxes_are_the_same_to_two_decimals(data):
+def test_real_labels_can_be_computed_from_their_boxes(data):
     folder = data / "kitti_object/training"
     for path in sorted(folder.glob("label_2/*.txt")):
         to_camera = read_calibration(folder / "calib" / path.name).lidar_to_camera

@@ -1,4 +1,4 @@
-"""Clouds of a sensor that leans, and looks aside, as nodes with its parameter file see them."""
+"""Clouds of a tilted sensor, converted to what nodes with its parameter file see."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from lidar_perception.wire.messages import to_frame
 from lidar_perception.wire.topics import ODOMETRY
 
 ROLL, PITCH, AHEAD = 3.0, -8.0, 130.0  # degrees
-# From the sensor's axes to level ones with x ahead
+# Rotation from the sensor's axes to level ones with x ahead
 UPRIGHT = Rotation.from_euler("z", -AHEAD, degrees=True) * Rotation.from_euler(
     "xy", [ROLL, PITCH], degrees=True)
 BODY = np.array([[-0.3, 0.2, -0.4], [0.1, 0.0, 0.5]])
@@ -38,29 +38,29 @@ CAMERA = Calibration(np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0
 
 
 def pose(i):
-    """Of a level sensor on its way."""
+    """Return the pose of a level sensor in frame i."""
     return make_pose([2.0 * i, 0.1 * i, 0.9], Rotation.from_euler("z", 0.1 * i).as_quat())
 
 
-def leaning():
-    """Frames of the sensor, with the robot's own returns as the first points."""
-    turn = np.eye(4)
-    turn[:3, :3] = UPRIGHT.as_matrix()
+def make_tilted_frames():
+    """Yield frames of the tilted sensor, whose first points are on the robot itself."""
+    rotation = np.eye(4)
+    rotation[:3, :3] = UPRIGHT.as_matrix()
     xyz = np.vstack([BODY, UPRIGHT.inv().apply(LEVEL)])
     box = np.concatenate([UPRIGHT.inv().apply(PERSON[:3]), PERSON[3:6],
                           [PERSON[6] + np.radians(AHEAD)]])
-    camera = Calibration(CAMERA.intrinsics, CAMERA.lidar_to_camera @ turn, CAMERA.width,
+    camera = Calibration(CAMERA.intrinsics, CAMERA.lidar_to_camera @ rotation, CAMERA.width,
                          CAMERA.height)
     numbers = np.arange(len(xyz), dtype=np.uint16)
     for i in range(3):
         yield Frame.of(str(i), LidarFrame.of(xyz, np.linspace(0, 1, len(xyz), dtype=np.float32),
                                              (i + 1) * 10**8, "front"),
-                       GroundTruth.of(box, [3]), camera, pose=lambda i=i: pose(i) @ turn,
+                       GroundTruth.of(box, [3]), camera, pose=lambda i=i: pose(i) @ rotation,
                        point_truth=lambda: PointTruth(numbers, numbers))
 
 
-def test_a_leaning_sensors_bag_becomes_level_with_all_that_belongs_to_it(tmp_path, monkeypatch):
-    write_bag(tmp_path / "leaning", leaning())
+def test_bag_of_tilted_sensor_is_converted_to_level(tmp_path, monkeypatch):
+    write_bag(tmp_path / "leaning", make_tilted_frames())
     (tmp_path / "robot.yaml").write_text(MOUNT)
     assert exit_of(monkeypatch, "convert", tmp_path / "leaning", "--robot", tmp_path / "robot.yaml",
                    "--out", tmp_path / "level") == 0
@@ -71,12 +71,12 @@ def test_a_leaning_sensors_bag_becomes_level_with_all_that_belongs_to_it(tmp_pat
         np.testing.assert_allclose(cloud.xyz, LEVEL, atol=1e-4)
         assert cloud.frame_id == "front_level" and labels.classes[0] == len(BODY)
         np.testing.assert_allclose(truth.boxes[0, :6], PERSON[:6], atol=1e-4)
-        assert truth.boxes[0, 6] == pytest.approx(PERSON[6], abs=0.02)  # it was about another z
+        assert truth.boxes[0, 6] == pytest.approx(PERSON[6], abs=0.02)  # the z axes differ
         np.testing.assert_allclose(frame.camera().projection, CAMERA.camera().projection, atol=1e-3)
         np.testing.assert_allclose(frame.pose(), pose(i), atol=1e-6)
 
 
-def test_a_level_sensor_at_another_height_is_turned_too(tmp_path, monkeypatch):
+def test_level_sensor_at_another_height_is_rotated(tmp_path, monkeypatch):
     floor = np.random.default_rng(2).uniform([-20, -20, -0.61], [20, 20, -0.59], (3000, 3))
     write_bag(tmp_path / "drive", [Frame.of(str(i), LidarFrame.of(floor, None, (i + 1) * 10**8,
                                                                   "front")) for i in range(3)])
@@ -92,33 +92,33 @@ def test_a_level_sensor_at_another_height_is_turned_too(tmp_path, monkeypatch):
 WORLD = np.random.default_rng(1).uniform(-20, 20, (400, 3)) + [1, 0, 0]
 
 
-def in_motion(stamp):
-    """The cloud of a turn of 0.1 s, of things that stand."""
+def make_moving_cloud(stamp):
+    """Return the cloud of static points, measured while the sensor moves for 0.1 s."""
     seconds = np.linspace(0, 0.1, len(WORLD))
-    seen = [invert_pose(base_at(stamp + t * 1e9) @ ON_BASE) @ [*point, 1]
-            for point, t in zip(WORLD, seconds)]
-    return cloud_message(np.array(seen)[:, :3], stamp, "lidar", time=seconds.astype(np.float32))
+    measured = [invert_pose(base_at(stamp + t * 1e9) @ ON_BASE) @ [*point, 1]
+                for point, t in zip(WORLD, seconds)]
+    return cloud_message(np.array(measured)[:, :3], stamp, "lidar", time=seconds.astype(np.float32))
 
 
 @pytest.mark.parametrize("moves", [moving(ODOMETRY), moving_tf()], ids=["odometry", "TF"])
-def test_a_bags_clouds_are_moved_to_their_stamps(moves, tmp_path, monkeypatch):
-    recorded(tmp_path / "robot", list(moves), mount(), cloud=in_motion)
+def test_clouds_of_a_bag_are_deskewed(moves, tmp_path, monkeypatch):
+    recorded(tmp_path / "robot", list(moves), mount(), cloud=make_moving_cloud)
     assert exit_of(monkeypatch, "convert", tmp_path / "robot", "--deskew", "--out",
                    tmp_path / "still") == 0
     for i, frame in enumerate(open_recording(tmp_path / "still")):
-        there = invert_pose(base_at(stamps()[i]) @ ON_BASE)
-        expected = WORLD @ there[:3, :3].T + there[:3, 3]
+        world_to_sensor = invert_pose(base_at(stamps()[i]) @ ON_BASE)
+        expected = WORLD @ world_to_sensor[:3, :3].T + world_to_sensor[:3, 3]
         np.testing.assert_allclose(frame.load().xyz, expected, atol=0.01)
-        blurred = to_frame(in_motion(stamps()[i]))[0].xyz
+        blurred = to_frame(make_moving_cloud(stamps()[i]))[0].xyz
         assert np.abs(blurred - expected).max() > 0.4
     assert i == CLOUDS - 1
 
 
 @pytest.mark.parametrize("parts, cloud, words", [
     ([moving(ODOMETRY), mount()], point, "no time column"),
-    ([], in_motion, "neither odometry nor a TF"),
+    ([], make_moving_cloud, "neither odometry nor a TF"),
 ], ids=["no times", "no poses"])
-def test_what_deskewing_lacks_is_said(parts, cloud, words, tmp_path, monkeypatch, capsys):
+def test_missing_times_or_poses_are_reported(parts, cloud, words, tmp_path, monkeypatch, capsys):
     recorded(tmp_path / "robot", *map(list, parts), cloud=cloud)
     assert exit_of(monkeypatch, "convert", tmp_path / "robot", "--deskew", "--out",
                    tmp_path / "out") == 2
@@ -133,15 +133,15 @@ def test_what_deskewing_lacks_is_said(parts, cloud, words, tmp_path, monkeypatch
      [], "crop.body in 'base'"),
     (MOUNT, ["--to", "openlabel"], "are for a recording with its clouds"),
 ])
-def test_what_cannot_be_used_is_said(content, more, words, tmp_path, monkeypatch, capsys):
-    write_bag(tmp_path / "bag", leaning())
+def test_unusable_parameters_are_reported(content, more, words, tmp_path, monkeypatch, capsys):
+    write_bag(tmp_path / "bag", make_tilted_frames())
     (tmp_path / "robot.yaml").write_text(content)
     assert exit_of(monkeypatch, "convert", tmp_path / "bag", "--robot", tmp_path / "robot.yaml",
                    "--out", tmp_path / "out", *more) == 2
     assert words in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
-def test_a_data_set_is_level_already(tmp_path, monkeypatch, capsys):
+def test_data_set_is_not_levelled(tmp_path, monkeypatch, capsys):
     root = object_folder(tmp_path / "kitti", walker_label())
     (tmp_path / "robot.yaml").write_text(MOUNT)
     assert exit_of(monkeypatch, "convert", root, "--robot", tmp_path / "robot.yaml", "--out",

@@ -1,4 +1,4 @@
-"""KITTI odometry, KITTI-360 and OpenPCDet's custom data: times, poses, calibration and labels."""
+"""KITTI odometry, KITTI-360 and OpenPCDet: times, poses, calibration and labels."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def stamps(recording):
 
 # KITTI odometry
 
-def test_odometry_has_the_recorded_times_and_poses_of_the_lidar(tmp_path):
+def test_odometry_has_recorded_times_and_lidar_poses(tmp_path):
     recording = open_recording(odometry_folder(tmp_path))
-    assert recording.timed and stamps(recording) == [
+    assert recording.has_times and stamps(recording) == [
         START_NS, START_NS + 103_600_000, START_NS + 103_600_000 + GAP_NS]
     for frame in recording:
         np.testing.assert_allclose(frame.pose(), drive(frame.index), atol=1e-9)
@@ -29,13 +29,13 @@ def test_odometry_has_the_recorded_times_and_poses_of_the_lidar(tmp_path):
                                    CALIBRATION.lidar_to_camera, atol=1e-9)
 
 
-def test_odometry_opens_with_any_of_its_files(tmp_path):
+def test_odometry_can_be_opened_with_any_of_its_files(tmp_path):
     root = odometry_folder(tmp_path) / "dataset"
     for sequence in ("00", "11"):
         (root / f"sequences/{sequence}/times.txt").unlink()
         (root / f"poses/{sequence}.txt").unlink()
     recording = open_recording(tmp_path)
-    assert recording.has == {CAMERA} and not recording.timed
+    assert recording.has == {CAMERA} and not recording.has_times
     assert np.diff(stamps(recording)).tolist() == [PERIOD_NS, GAP_NS]
     assert recording.frames[0].pose() is None
     assert len(open_recording(root / "sequences/00")) == 2
@@ -53,9 +53,9 @@ def test_times_since_1970_are_stamps(tmp_path):
 
 
 @pytest.mark.parametrize("text, words", [
-    ("0\n", "has 1 lines, and none for scan 1; download"), ("0\nlater\n", "no number of seconds"),
-    ("0\nnan\n", "no number of seconds")])
-def test_times_that_are_missing_or_wrong_are_named(tmp_path, text, words):
+    ("0\n", "has only 1 lines, but there is a scan 1; download"),
+    ("0\nlater\n", "not a number of seconds"), ("0\nnan\n", "not a number of seconds")])
+def test_missing_or_invalid_times_are_reported(tmp_path, text, words):
     write(odometry_folder(tmp_path) / "dataset/sequences/00/times.txt", text)
     with pytest.raises(InputError, match=rf"times\.txt .*{words}"):
         open_recording(tmp_path)
@@ -68,16 +68,16 @@ CAM_TO_POSE = np.column_stack([RECTIFY @ [[0, 0, 1], [1, 0, 0], [0, 1, 0]], [1.5
 
 
 def world(i):
-    """(4, 4) the LiDAR in the world."""
+    """Return the pose (4, 4) of the LiDAR in the world."""
     pose = drive(i)
     pose[:3, 3] += [1000, 3000, 115]
     return pose
 
 
-def with_calibration(root, poses):
-    """poses: the name of their file."""
+def add_calibration(root, poses):
+    """Add calibration and poses; `poses` is the name of their file."""
     to_camera = np.linalg.inv(np.vstack([np.column_stack([RECTIFY, [0, 0, 0]]), [0, 0, 0, 1]])
-                              ) @ LIDAR_TO_CAMERA  # not rectified
+                              ) @ LIDAR_TO_CAMERA  # unrectified camera
     mount = np.vstack([CAM_TO_POSE, [0, 0, 0, 1]])
     write(root / "calibration/calib_cam_to_velo.txt", numbers(np.linalg.inv(to_camera)[:3]))
     write(root / "calibration/calib_cam_to_pose.txt", f"image_00: {numbers(CAM_TO_POSE)}\n")
@@ -91,29 +91,29 @@ def with_calibration(root, poses):
     return root
 
 
-def test_kitti360_has_the_times_of_its_lines(tmp_path):
+def test_kitti360_has_recorded_times(tmp_path):
     recording = open_recording(kitti360_folder(tmp_path))
     start = 1_369_730_762_004_700_000
     assert stamps(recording) == [start + i * PERIOD_NS for i in (0, 1, 3)]
-    assert recording.timed and [frame.index for frame in recording] == [0, 1, 3]
+    assert recording.has_times and [frame.index for frame in recording] == [0, 1, 3]
     (tmp_path / f"data_3d_raw/{NAME}/velodyne_points/timestamps.txt").unlink()
-    assert not open_recording(tmp_path).timed
+    assert not open_recording(tmp_path).has_times
 
 
 @pytest.mark.parametrize("poses", ["cam0_to_world.txt", "poses.txt"])
-def test_kitti360_has_poses_of_the_lidar_and_a_camera(tmp_path, poses):
-    root = with_calibration(kitti360_folder(tmp_path), poses)
+def test_kitti360_has_lidar_poses_and_a_camera(tmp_path, poses):
+    root = add_calibration(kitti360_folder(tmp_path), poses)
     recording = open_recording(root)
     assert recording.has == {CAMERA, POSES}
-    first, without, last = recording.frames
-    assert without.pose() is None
+    first, second, last = recording.frames
+    assert second.pose() is None
     for frame in (first, last):
         np.testing.assert_allclose(frame.pose(), world(frame.index), atol=1e-6)
         np.testing.assert_allclose(frame.calibration().lidar_to_camera, LIDAR_TO_CAMERA, atol=1e-9)
         assert (frame.calibration().width, frame.calibration().height) == (1408, 376)
-        assert type(frame.calibration().width) is int  # as JSON takes it
+        assert type(frame.calibration().width) is int  # required by JSON
     write(root / f"data_poses/{NAME}/{poses}", "0 1 2 3\n")
-    with pytest.raises(InputError, match=rf"{poses} has a line that is not 1\d finite numbers"):
+    with pytest.raises(InputError, match=rf"{poses} has a line without 1\d finite numbers"):
         open_recording(root).frames[0].pose()
 
 
@@ -134,13 +134,13 @@ def test_openpcdet_labels_are_boxes_in_the_lidar_frame(tmp_path):
     assert truth.boxes[0].tolist() == [12, 0, -0.98, 3.9, 1.6, 1.5, 0.1]
     assert [extra.get("class_name") for extra in truth.extras] == [None, None, "traffic cone", None]
     assert len(second.truth()) == 0 and third.truth() is None
-    assert [name for name, _ in recording.lost] == ["000007"]
+    assert [name for name, _ in recording.missing_scans] == ["000007"]
     assert np.array_equal(first.load().xyz, scene(0)[:, :3])
     assert [f.name for f in open_recording(root, split=root / "ImageSets/train.txt")] == [
         "000000", "000002"]
 
 
-def test_openpcdet_takes_more_columns_and_no_labels(tmp_path):
+def test_openpcdet_accepts_more_columns_and_no_labels(tmp_path):
     root = openpcdet_folder(tmp_path)
     np.save(root / "points/000000.npy", np.column_stack([scene(0)] * 2))
     for label in (root / "labels").iterdir():
@@ -152,7 +152,7 @@ def test_openpcdet_takes_more_columns_and_no_labels(tmp_path):
 
 @pytest.mark.parametrize("line", ["1 2 3 4 5 6 7", "1 2 3 4 5 6 left Car", "Car 1 2 3 4 5 6 7",
                                   "1 2 3 4 0 6 7 Car", "1 nan 3 4 5 6 7 Car"])
-def test_a_broken_line_of_openpcdet_is_named(tmp_path, line):
+def test_invalid_openpcdet_line_is_reported(tmp_path, line):
     root = openpcdet_folder(tmp_path)
     write(root / "labels/000000.txt", f"12 0 0 4 2 1 0 Car\n{line}\n")
     with pytest.raises(InputError, match=r"000000\.txt:2 is not 'x y z dx dy dz heading class'"):
@@ -161,11 +161,11 @@ def test_a_broken_line_of_openpcdet_is_named(tmp_path, line):
 
 
 @pytest.mark.parametrize("file, content, words", [
-    ("dataset/poses/00.txt", "1 0 0 0 0 1 0 0 0 0 1 nan\n", "is no rotation"),
-    ("dataset/poses/00.txt", "1 9 0 0 0 1 0 0 0 0 1 0\n", "is no rotation"),
+    ("dataset/poses/00.txt", "1 0 0 0 0 1 0 0 0 0 1 nan\n", "is not a rotation"),
+    ("dataset/poses/00.txt", "1 9 0 0 0 1 0 0 0 0 1 0\n", "is not a rotation"),
     ("dataset/sequences/00/calib.txt", "P2: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: 1 0 0 0 1 0 0 0 1 0 0 0\n",
-     "is no rotation")])
-def test_poses_that_are_none_are_named(tmp_path, file, content, words):
+     "is not a rotation")])
+def test_invalid_poses_are_reported(tmp_path, file, content, words):
     write(odometry_folder(tmp_path) / file, content)
     with pytest.raises(InputError, match=words) as error:
         open_recording(tmp_path).frames[0].pose()

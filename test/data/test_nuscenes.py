@@ -1,5 +1,4 @@
-"""nuScenes folders: points and boxes share a frame, tables are read in any order and in pieces, and
-what is missing or wrong is named."""
+"""nuScenes folders: frames, labels, velocities, and errors in tables and sweeps."""
 
 from __future__ import annotations
 
@@ -21,16 +20,16 @@ from lidar_perception.data.nuscenes.boxes import (
     CATEGORIES,
     NAMES,
     GlobalBoxes,
-    in_frame,
-    in_global,
+    to_global_boxes,
+    to_local_boxes,
 )
-from lidar_perception.data.nuscenes.folder import OWN_VEHICLE, SWEEP, open_nuscenes
+from lidar_perception.data.nuscenes.folder import EGO_RADIUS_M, SWEEP, open_nuscenes
 from lidar_perception.data.nuscenes.tables import Tables
 from lidar_perception.data.records import read_records
 from lidar_perception.geometry import box_corners, points_in_box, wrap_angle
 from lidar_perception.types import InputError
 
-TABLES = folder.made_tables(seed=3, frames=4, objects=30)
+TABLES = folder.make_tables(seed=3, frames=4, objects=30)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +39,7 @@ def root(tmp_path_factory):
 
 @pytest.fixture
 def changed(tmp_path):
-    """Write the tables after a change, without sweeps."""
+    """Return a function that writes the tables after a change, without sweeps."""
     def write(change=lambda tables: None, version=folder.VERSION):
         tables = copy.deepcopy(TABLES)
         change(tables)
@@ -48,7 +47,7 @@ def changed(tmp_path):
     return write
 
 
-def labels_of(frame):
+def find_labels(frame):
     return [row for row in TABLES["sample_annotation"] if row["sample_token"] == frame.native.token]
 
 
@@ -59,7 +58,7 @@ def same_frames(a, b):
         for f, g in zip(a, b))
 
 
-def test_key_frames_come_by_scene_and_time(root):
+def test_key_frames_are_ordered_by_scene_and_time(root):
     frames = open_nuscenes(root)
     assert [f.name for f in frames] == [f"{s}/{i:02}" for s in folder.SCENES for i in range(4)]
     assert [f.native.token for f in frames] == [f"s{s}k{i}" for s in range(2) for i in range(4)]
@@ -68,10 +67,10 @@ def test_key_frames_come_by_scene_and_time(root):
     assert {f.sensor_height for f in frames} == {folder.SENSOR[2]}
 
 
-def test_points_made_inside_a_box_are_inside_it_when_read(root):
+def test_points_inside_a_box_are_inside_it_when_read(root):
     boxes = 0
     for frame in open_nuscenes(root):
-        scan, truth, rows = frame.load(), frame.truth(), labels_of(frame)
+        scan, truth, rows = frame.load(), frame.truth(), find_labels(frame)
         assert len(truth) == len(rows)
         for i, (box, extras) in enumerate(zip(truth.boxes, truth.extras)):
             assert extras["lidar_points"] == rows[i]["num_lidar_pts"]
@@ -82,7 +81,7 @@ def test_points_made_inside_a_box_are_inside_it_when_read(root):
     assert boxes > 100
 
 
-def test_y_of_the_sensor_is_forward_and_x_is_right(changed):
+def test_sensor_axes_are_rotated_to_those_of_the_vehicle(changed):
     def straight(tables):
         for row in tables["calibrated_sensor"]:
             row["rotation"] = [np.sqrt(0.5), 0, 0, -np.sqrt(0.5)]
@@ -97,21 +96,21 @@ def test_y_of_the_sensor_is_forward_and_x_is_right(changed):
     assert read_records(frame.points, SWEEP).shape == (6, 5) and scan.stamp_ns == frame.stamp_ns
 
 
-def test_returns_of_the_vehicle_itself_are_left_out(root):
+def test_returns_of_the_vehicle_itself_are_dropped(root):
     frame = open_nuscenes(root)[0]
     cloud, scan = read_records(frame.points, SWEEP), frame.load()
-    own = (np.abs(cloud[:, :2]) < OWN_VEHICLE).all(axis=1)
+    own = (np.abs(cloud[:, :2]) < EGO_RADIUS_M).all(axis=1)
     assert own.sum() >= 50 and len(scan) == len(cloud) - own.sum()
 
 
-def test_the_global_pose_takes_boxes_of_a_frame_to_the_labels(root):
+def test_pose_transforms_frame_boxes_to_global_labels(root):
     for frame in open_nuscenes(root):
-        rows, truth = labels_of(frame), frame.truth()
-        centres, sizes, rotations = in_global(truth.boxes, frame.pose())
+        rows, truth = find_labels(frame), frame.truth()
+        centres, sizes, rotations = to_global_boxes(truth.boxes, frame.pose())
         np.testing.assert_allclose(centres, [r["translation"] for r in rows], atol=1e-9)
         np.testing.assert_allclose(sizes[:, [1, 0, 2]], [r["size"] for r in rows])
         for row, rotation in zip(rows, rotations):
-            assert abs(np.dot(row["rotation"], rotation)) > 1 - 1e-3  # leans as the vehicle does
+            assert abs(np.dot(row["rotation"], rotation)) > 1 - 1e-3  # the vehicle is tilted
             assert abs(wrap_angle(reference.yaw(row["rotation"]) - reference.yaw(rotation))) < 1e-3
         assert np.linalg.norm(frame.pose()[:3, 3] - frame.native.ego) == pytest.approx(
             np.linalg.norm(folder.SENSOR))
@@ -121,36 +120,38 @@ angles = st.floats(-3.1, 3.1)
 
 
 @given(st.integers(0, 2**32 - 1), angles, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
-def test_to_the_global_frame_and_back(seed, yaw, pitch, roll):
+def test_global_transform_is_invertible(seed, yaw, pitch, roll):
     rng = np.random.default_rng(seed)
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("zyx", [yaw, pitch, roll]).as_matrix()
     pose[:3, 3] = rng.uniform(-2000, 2000, 3)
     boxes = np.column_stack([rng.uniform(-50, 50, (5, 3)), rng.uniform(0.3, 9, (5, 3)),
                              rng.uniform(-3.1, 3.1, 5)])
-    made = GlobalBoxes.of(*in_global(boxes, pose), 0)
-    np.testing.assert_allclose(in_frame(made, pose), boxes, atol=1e-8)
-    # The same solid: its corners move as points do.
+    moved = GlobalBoxes.of(*to_global_boxes(boxes, pose), 0)
+    np.testing.assert_allclose(to_local_boxes(moved, pose), boxes, atol=1e-8)
+    # The box is transformed rigidly: its corners move as points do.
     corners = box_corners(boxes)
-    for box, centre, rotation, own in zip(boxes, made.centres, made.rotations, corners):
+    for box, centre, rotation, own in zip(boxes, moved.centres, moved.rotations, corners):
         signs = np.array([[x, y, z] for z in (-1, 1) for x, y in ((1, 1), (-1, 1), (-1, -1),
                                                                    (1, -1))]) / 2
-        there = Rotation.from_quat(np.roll(rotation, -1)).apply(signs * box[3:6]) + centre
-        np.testing.assert_allclose(own @ pose[:3, :3].T + pose[:3, 3], there, atol=1e-8)
+        expected = Rotation.from_quat(np.roll(rotation, -1)).apply(signs * box[3:6]) + centre
+        np.testing.assert_allclose(own @ pose[:3, :3].T + pose[:3, 3], expected, atol=1e-8)
 
 
-def test_an_empty_frame_has_no_boxes():
-    assert len(GlobalBoxes.none()) == 0 and in_frame(GlobalBoxes.none(), np.eye(4)).shape == (0, 7)
-    assert [a.shape for a in in_global(np.zeros((0, 7)), np.eye(4))] == [(0, 3), (0, 3), (0, 4)]
-    assert len(GlobalBoxes.together([])) == 0
+def test_empty_boxes_are_transformed():
+    empty = GlobalBoxes.none()
+    assert len(empty) == 0 and to_local_boxes(empty, np.eye(4)).shape == (0, 7)
+    assert [a.shape for a in to_global_boxes(np.zeros((0, 7)), np.eye(4))] == [
+        (0, 3), (0, 3), (0, 4)]
+    assert len(GlobalBoxes.concatenate([])) == 0
 
 
-def test_velocities_are_those_of_a_second_reading(root):
+def test_velocities_match_the_reference(root):
     times = {r["token"]: r["timestamp"] for r in TABLES["sample"]}
     rows = {r["token"]: r for r in TABLES["sample_annotation"]}
     known = unknown = 0
     for frame in open_nuscenes(root):
-        for row, found in zip(labels_of(frame), frame.native.labels().boxes.velocities):
+        for row, found in zip(find_labels(frame), frame.native.labels().boxes.velocities):
             expected = reference.velocity(row, rows, times)
             if expected is None:
                 assert np.isnan(found).all()
@@ -161,12 +162,12 @@ def test_velocities_are_those_of_a_second_reading(root):
     assert known > 50 and unknown > 10
 
 
-def test_labels_have_their_names(root):
+def test_labels_have_names_and_attributes(root):
     tracks = {}
     for frame in open_nuscenes(root):
         truth = frame.truth()
-        for row, extras, label in zip(labels_of(frame), truth.extras, truth.labels):
-            category = folder.category_of(TABLES, row)
+        for row, extras, label in zip(find_labels(frame), truth.extras, truth.labels):
+            category = folder.find_category(TABLES, row)
             assert extras["category"] == category
             assert extras["detection_name"] == CATEGORIES.get(category)
             names = [TABLES["attribute"][int(t[1:])]["name"] for t in row["attribute_tokens"]]
@@ -178,14 +179,14 @@ def test_labels_have_their_names(root):
                         "Cyclist" if names == ["cycle.with_rider"] else "Misc"}.get(
                 category, "Pedestrian" if "pedestrian" in category else "Misc")
             assert label == expected
-        assert len(frame.native.labels().racks()) == sum(
-            folder.category_of(TABLES, row) == "static_object.bicycle_rack"
-            for row in labels_of(frame))
+        assert len(frame.native.labels().bicycle_racks()) == sum(
+            folder.find_category(TABLES, row) == "static_object.bicycle_rack"
+            for row in find_labels(frame))
     assert len(set(tracks.values())) == len(tracks)
     assert set(CATEGORIES.values()) == set(NAMES) and len(ATTRIBUTES) == 8
 
 
-def test_the_order_of_rows_does_not_matter(root, changed):
+def test_order_of_rows_does_not_matter(root, changed):
     def shuffle(tables):
         rng = np.random.default_rng(5)
         for name, rows in tables.items():
@@ -195,14 +196,14 @@ def test_the_order_of_rows_does_not_matter(root, changed):
 
 
 @pytest.mark.parametrize("chunk", [1000, 1777])
-def test_a_table_may_be_read_in_pieces_of_any_size(root, monkeypatch, chunk):
+def test_tables_can_be_read_in_chunks_of_any_size(root, monkeypatch, chunk):
     whole = open_nuscenes(root)
-    monkeypatch.setattr(nuscenes_tables, "CHUNK", chunk)
-    monkeypatch.setattr(nuscenes_labels, "BLOCK", 7)
+    monkeypatch.setattr(nuscenes_tables, "CHUNK_SIZE", chunk)
+    monkeypatch.setattr(nuscenes_labels, "BLOCK_SIZE", 7)
     assert same_frames(open_nuscenes(root), whole)
 
 
-def test_a_table_on_one_line_or_empty(tmp_path):
+def test_table_may_be_on_one_line_or_empty(tmp_path):
     (tmp_path / "v").mkdir()
     for text, rows in ('[{"a":1,"b":"x, ] y"},{"b":2,"a":0}]', [(1, "x, ] y"), (0, 2)]), (
             " [ ] \n", []):
@@ -210,7 +211,7 @@ def test_a_table_on_one_line_or_empty(tmp_path):
         assert list(Tables(tmp_path, "v").rows("t", "a", "b")) == rows
 
 
-def test_a_version_without_labels_has_frames_all_the_same(changed):
+def test_version_without_labels_has_frames(changed):
     root = changed(lambda tables: tables["sample_annotation"].clear())
     assert {f.truth() for f in open_nuscenes(root)} == {None}
     root = changed(lambda tables: tables.pop("sample_annotation"), "v1.0-test")
@@ -235,11 +236,11 @@ def put(table, **values):
     (lambda t: t["sample"][2].pop("timestamp"), "sample.json: row 2 has no timestamp"),
     (lambda t: t["sample"].insert(1, 7), "sample.json: row 1 has no token"),
     (put("sample", token="s0k1"), "sample.json has rows with the same token"),
-    (drop("sample_data", "s0k1topTrue"), "no LIDAR_TOP of 1 of 8 key frames, such as s0k1"),
+    (drop("sample_data", "s0k1topTrue"), "no LIDAR_TOP for 1 of 8 key frames, such as s0k1"),
     (drop("ego_pose", "s0k1topTrue"), "ego_pose.json has no row s0k1topTrue"),
     (drop("instance", "s0o0"), "the instance s0o0 of s0o0k"),
     (drop("category", "c0"), "has no category"),
-    (put("sample_annotation", prev="gone"), "the label gone is named"),
+    (put("sample_annotation", prev="gone"), "the label gone, which another one links to"),
     (put("sample_annotation", rotation=[0, 0, 0, 0]), "a rotation is not a quaternion"),
     (put("sample_annotation", rotation=[1e308, 0, 0, 0]), "a rotation is not a quaternion"),
     (put("ego_pose", rotation=[1e-200, 0, 0, 0]), "a rotation is not a quaternion"),
@@ -248,20 +249,20 @@ def put(table, **values):
     (put("sample_annotation", translation=[1, None, 2]), "a translation is not"),
     (put("ego_pose", translation="x"), "ego_pose.json: a translation is not 3 finite"),
     (put("ego_pose", rotation=[10**400, 0, 0, 0]), "ego_pose.json: a rotation is not"),
-    *((put("sample", timestamp=time), "sample.json: row 0: timestamp is no time")
+    *((put("sample", timestamp=time), "sample.json: row 0: timestamp is not a time")
       for time in (1e38, 10**38, -1, "now", None)),
-    (put("sample_data", filename=7), "sample_data.json: row 0: filename is no text"),
-    (put("scene", token=[]), "scene.json: row 0: token is no text"),
-    (put("sample_annotation", attribute_tokens=5), "attribute_tokens is no list"),
+    (put("sample_data", filename=7), "sample_data.json: row 0: filename is not a text"),
+    (put("scene", token=[]), "scene.json: row 0: token is not a text"),
+    (put("sample_annotation", attribute_tokens=5), "attribute_tokens is not a list"),
     (put("calibrated_sensor", rotation=[1, 0, 0, float("nan")]), "a rotation is not"),
 ])
-def test_tables_that_are_wrong_are_named(changed, change, words):
+def test_invalid_tables_are_reported(changed, change, words):
     with pytest.raises(InputError, match=words) as caught:
         open_nuscenes(changed(change))[0].truth()
     assert "\n" not in str(caught.value)
 
 
-def test_a_name_that_no_file_can_have_is_named(changed):
+def test_invalid_file_name_is_reported(changed):
     with pytest.raises(InputError, match=r"x00b' is no name of a file"):
         for frame in open_nuscenes(changed(lambda tables: [
                 row.update(filename="a\0b") for row in tables["sample_data"]])):
@@ -273,26 +274,26 @@ def test_a_name_that_no_file_can_have_is_named(changed):
     lambda text: text.replace("token", "tok\x00en", 1), lambda text: text.rstrip("]\n"),
     lambda text: text.replace("[", "[" * 100_000, 2),
 ])
-def test_tables_that_are_cut_are_named(changed, damage):
+def test_damaged_tables_are_reported(changed, damage):
     root = changed()
     path = root / folder.VERSION / "ego_pose.json"
     path.write_text(damage(path.read_text()))
-    with pytest.raises(InputError, match=r"ego_pose.json .*download the tables of v1.0-mini") as c:
+    with pytest.raises(InputError, match=r"ego_pose.json .*download the tables of v1.0") as caught:
         open_nuscenes(root)
-    assert "\n" not in str(c.value)
+    assert "\n" not in str(caught.value)
 
 
-def test_damage_in_a_large_table_is_found_without_reading_on(changed, monkeypatch):
+def test_damage_in_a_large_table_is_found_early(changed, monkeypatch):
     root = changed()
     path = root / folder.VERSION / "ego_pose.json"
     text = json.dumps(TABLES["ego_pose"] * 50).replace("{", "{?", 1)
-    path.write_bytes(text.encode() + b"\xff")  # who reads to the end stumbles over this first
-    monkeypatch.setattr(nuscenes_tables, "CHUNK", 1000)
-    with pytest.raises(InputError, match=r"ego_pose.json is cut or damaged"):
+    path.write_bytes(text.encode() + b"\xff")  # would cause another error if it were read
+    monkeypatch.setattr(nuscenes_tables, "CHUNK_SIZE", 1000)
+    with pytest.raises(InputError, match=r"ego_pose.json is truncated or damaged"):
         open_nuscenes(root)
 
 
-def test_wrong_folders_are_named(root, tmp_path):
+def test_wrong_folder_is_reported(root, tmp_path):
     for place, version, words in (
             (tmp_path / "none", "v1.0-mini", "none is not a folder"),
             (root, "v1.0-trainval", "no folder v1.0-trainval; its versions are: v1.0-mini"),
@@ -302,7 +303,7 @@ def test_wrong_folders_are_named(root, tmp_path):
             open_nuscenes(place, version)
 
 
-def test_sweeps_that_are_missing_or_cut_are_named(changed):
+def test_missing_or_truncated_sweep_is_reported(changed):
     frame = open_nuscenes(changed())[0]
     with pytest.raises(InputError, match=r"cannot read .*s0k0topTrue.pcd.bin"):
         frame.load()
@@ -314,7 +315,7 @@ def test_sweeps_that_are_missing_or_cut_are_named(changed):
     assert len(frame.load()) == 0
 
 
-def test_a_real_sweep(data, changed):
+def test_real_sweep_is_read(data, changed):
     path, = (data / "nuscenes").glob("*.pcd.bin")
     frame = open_nuscenes(changed())[0]
     frame.points.parent.mkdir(parents=True)
@@ -322,7 +323,7 @@ def test_a_real_sweep(data, changed):
     scan = frame.load()
     assert len(read_records(path, SWEEP)) == 34688 and 25_000 < len(scan) < 34688
     assert 0 <= scan.intensity.min() and 0.5 < scan.intensity.max() <= 1
-    # The ground lies where the calibration says.
+    # The ground is at the height given by the calibration.
     near = np.hypot(scan.xyz[:, 0], scan.xyz[:, 1]) < 12
     heights = scan.xyz[near & (scan.xyz[:, 2] < -1), 2]
     assert np.median(heights) == pytest.approx(-folder.SENSOR[2], abs=0.15)

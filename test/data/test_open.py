@@ -1,4 +1,4 @@
-"""One opener: what lies at a path is recognised and said, and split files choose from it."""
+"""Opening of recordings in all layouts, and split files."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ from msg_utils.stamps import header_message
 
 
 @each_recording
-def test_what_lies_there_is_recognised_said_and_read(tmp_path, monkeypatch, kind):
-    make, inner, said, has = MADE[kind]
+def test_layouts_are_recognised_and_read(tmp_path, monkeypatch, kind):
+    make, inner, description, has = MADE[kind]
     root = make(tmp_path / kind)
     names = [frame.name for frame in open_recording(root)]
     assert len(set(names)) == len(names)
     for part in inner:
         recording = open_recording(root / part)
-        assert str(recording) == ", ".join([f"{root / part}: {said}", *sorted(has)])
+        assert str(recording) == ", ".join([f"{root / part}: {description}", *sorted(has)])
         assert recording.has == has and [frame.name for frame in recording] == names
-        for frame, same in zip(recording, recording.reopen().frames, strict=True):
-            assert (frame.name, frame.stamp_ns) == (same.name, same.stamp_ns)
-            assert len(frame.load()) and np.array_equal(frame.load().xyz, same.load().xyz)
+        for frame, reopened in zip(recording, recording.reopen().frames, strict=True):
+            assert (frame.name, frame.stamp_ns) == (reopened.name, reopened.stamp_ns)
+            assert len(frame.load()) and np.array_equal(frame.load().xyz, reopened.load().xyz)
             assert frame.load().stamp_ns == frame.stamp_ns
             assert (frame.camera() is not None) == (CAMERA in has)
             assert type(frame.calibration().width) is int if CAMERA in has else True
@@ -57,20 +57,20 @@ def test_what_lies_there_is_recognised_said_and_read(tmp_path, monkeypatch, kind
         if (root / part).is_dir():
             monkeypatch.chdir(root / part)
             assert [frame.name for frame in open_recording(".")] == names
-    for what in (BOXES, POINT_LABELS, CAMERA, POSES):
-        if what in has:
-            recording.require(what, "evaluate")
+    for content in (BOXES, POINT_LABELS, CAMERA, POSES):
+        if content in has:
+            recording.require(content, "evaluate")
         else:
             with pytest.raises(InputError, match=r"has no .*, which evaluate needs") as error:
-                recording.require(what, "evaluate")
-            assert what.removeprefix("a ") in str(error.value) and said.split(",")[0] in str(
-                error.value)
+                recording.require(content, "evaluate")
+            assert content.removeprefix("a ") in str(error.value)
+            assert description.split(",")[0] in str(error.value)
     for a, b in pairwise(recording):
         assert a.stamp_ns < b.stamp_ns or a.sequence != b.sequence
         assert a.index < b.index or a.sequence != b.sequence
 
 
-def test_one_sequence_of_semantickitti_is_a_recording(tmp_path):
+def test_semantickitti_sequence_is_a_recording(tmp_path):
     root = semantic_folder(tmp_path)
     assert [f.name for f in open_recording(root / "sequences/08")] == ["08/000000"]
     (root / "sequences").rename(root / "inner")
@@ -80,15 +80,15 @@ def test_one_sequence_of_semantickitti_is_a_recording(tmp_path):
 
 
 @pytest.mark.usefixtures("streets", "tiny_sensor")
-def test_what_simulate_wrote_is_recognised(made):
-    said = {str(open_recording(made / layout)).partition(": ")[2] for layout in (
+def test_simulated_data_sets_are_recognised(made):
+    descriptions = {str(open_recording(made / layout)).partition(": ")[2] for layout in (
         "kitti", "kitti-tracking", "semantickitti")}
-    assert said == {"KITTI object data, 5 frames, a camera, labelled boxes",
-                    "KITTI tracking data, 5 frames, a camera, labelled boxes",
-                    "SemanticKITTI, 5 frames, labelled points, poses"}
+    assert descriptions == {"KITTI object data, 5 frames, a camera, labelled boxes",
+                            "KITTI tracking data, 5 frames, a camera, labelled boxes",
+                            "SemanticKITTI, 5 frames, labelled points, poses"}
 
 
-def test_clouds_in_files_have_the_order_and_the_times_of_their_names(tmp_path):
+def test_cloud_files_have_order_and_times_of_their_names(tmp_path):
     folder = cloud_folder(tmp_path / "counted")
     assert [f.name for f in open_recording(folder)] == ["scan1", "scan2", "scan10"]
     assert [f.name for f in open_recording(folder / "scan10.bin")] == ["scan10"]
@@ -105,8 +105,8 @@ def test_clouds_in_files_have_the_order_and_the_times_of_their_names(tmp_path):
         assert "no times" in str(open_recording(timed))
 
 
-def test_the_clouds_of_a_bag_are_found_or_named(tmp_path):
-    def bag(name, *topics):
+def test_cloud_topic_of_a_bag_is_found_or_chosen(tmp_path):
+    def write_clouds(name, *topics):
         with BagWriter(tmp_path / name) as writer:
             for topic in topics:
                 writer.add_topic(topic, "sensor_msgs/msg/PointCloud2")
@@ -116,10 +116,10 @@ def test_the_clouds_of_a_bag_are_found_or_named(tmp_path):
                         header_message(STAMP + i, "lidar", bag_message), bag_message))
         return tmp_path / name
 
-    assert "on /ouster/points, 2" in str(open_recording(bag("one", "/ouster/points")))
-    assert "on /points, 2" in str(open_recording(bag("ours", "/ouster/points", "/points")))
-    both = bag("both", "/front", "/rear")
-    with pytest.raises(InputError, match=r"clouds on /front, /rear; name .*both:/front$"):
+    assert "on /ouster/points, 2" in str(open_recording(write_clouds("one", "/ouster/points")))
+    assert "on /points, 2" in str(open_recording(write_clouds("ours", "/ouster/points", "/points")))
+    both = write_clouds("both", "/front", "/rear")
+    with pytest.raises(InputError, match=r"clouds on /front, /rear; choose .*both:/front$"):
         open_recording(both)
     for recording in (open_recording(f"{both}:/rear"), open_recording(both, points="/rear")):
         assert "on /rear, 2" in str(recording) and len(recording.reopen()) == 2
@@ -128,8 +128,8 @@ def test_the_clouds_of_a_bag_are_found_or_named(tmp_path):
         open_recording(f"{both}:/side")
 
 
-@pytest.mark.parametrize("height, taken", [(0.6, 0.6), (1.8, SENSOR_HEIGHT)])
-def test_commands_measure_the_height_that_a_recording_does_not_say(tmp_path, height, taken):
+@pytest.mark.parametrize("height, expected", [(0.6, 0.6), (1.8, SENSOR_HEIGHT)])
+def test_commands_measure_an_unknown_sensor_height(tmp_path, height, expected):
     rng = np.random.default_rng(0)
     ground = rng.uniform([-20, -20, -0.02], [20, 20, 0.02], (9000, 3)) - [0, 0, height]
     cloud = np.column_stack([ground, np.ones(len(ground))]).astype(np.float32)
@@ -138,74 +138,75 @@ def test_commands_measure_the_height_that_a_recording_does_not_say(tmp_path, hei
     write(tmp_path / "files/0.bin", cloud.tobytes())
     for path in (tmp_path / "bag", tmp_path / "files"):
         recording = opened(path)
-        for each in (recording, recording.reopen()):
-            heights = [f.sensor_height for f in (*each, each.frames[0], *each.frames[-1:])]
-            assert heights == pytest.approx([taken] * len(heights), abs=0.02)
+        for frames in (recording.frames, recording.reopen().frames):
+            heights = [f.sensor_height for f in (*frames, frames[0], *frames[-1:])]
+            assert heights == pytest.approx([expected] * len(heights), abs=0.02)
         assert {f.sensor_height for f in open_recording(path)} == {SENSOR_HEIGHT}
         assert {f.sensor_height for f in open_recording(path, sensor_height=3.0)} == {3.0}
 
 
 @pytest.mark.parametrize("make, words", [
-    (lambda p: p / "missing", "there is no .*missing; give a bag or the folder of a data set"),
-    (lambda p: p, "no recording that can be read: expected a rosbag2 bag, or the folder of KITTI"),
-    (lambda p: write(p / "notes.txt", b"text"), "no bag; give the folder of a rosbag2 bag"),
+    (lambda p: p / "missing", "missing does not exist; give a bag or the folder of a data set"),
+    (lambda p: p, "in a supported format: expected a rosbag2 bag, or the folder of KITTI"),
+    (lambda p: write(p / "notes.txt", b"text"), "not a bag; give the folder of a rosbag2 bag"),
     (lambda p: write(p / "training/velodyne/x", b"").parents[2], "has no KITTI scans: expected"),
-    (lambda p: write(p / "sequences/00/x", b"").parents[2], "no SemanticKITTI scans: expected"),
-    (lambda p: nuscenes_folder.save(nuscenes_root(p), nuscenes_folder.made_tables(), "v1.0-test",
-                                    False), "several versions; give one: .*v1.0-mini, .*v1.0-test"),
+    (lambda p: write(p / "sequences/00/x", b"").parents[2],
+     "no scans of KITTI odometry or SemanticKITTI: expected"),
+    (lambda p: nuscenes_folder.save(nuscenes_root(p), nuscenes_folder.make_tables(), "v1.0-test",
+                                    False), "several versions; give one of them: .*v1.0-test"),
 ])
-def test_what_is_no_recording_is_named_with_the_remedy(tmp_path, make, words):
+def test_invalid_recording_is_reported_with_remedy(tmp_path, make, words):
     with pytest.raises(InputError, match=words) as error:
         open_recording(make(tmp_path))
     assert "\n" not in str(error.value) and str(tmp_path) in str(error.value)
 
 
-def test_labels_without_a_scan_are_lost_and_named(tmp_path):
+def test_labels_without_scan_are_listed(tmp_path):
     root = object_folder(tmp_path, count=3)
     (root / "training/velodyne/000001.bin").unlink()
     recording = open_recording(root)
     assert [f.name for f in recording] == ["000000", "000002"]
-    (name, reason), = recording.lost
+    (name, reason), = recording.missing_scans
     assert name == "000001" and "000001.txt has no scan; download it again" in reason
-    waiting = open_recording(root, scans=False)
-    assert len(waiting) == 3 and waiting.lost == ()
+    labels_only = open_recording(root, scans=False)
+    assert len(labels_only) == 3 and labels_only.missing_scans == ()
 
 
 # splits
 
 @each_recording
-def test_a_split_names_frames_in_its_order_each_once(tmp_path, kind):
+def test_split_selects_frames_in_its_order_once(tmp_path, kind):
     root = MADE[kind][0](tmp_path / kind)
     names = [frame.name for frame in open_recording(root)]
-    asked = [names[-1], names[0], names[-1]]
-    recording = open_recording(root, split=write(tmp_path / "split.txt", "\n".join(asked)))
-    assert [f.name for f in recording] == [f.name for f in recording.reopen()] == asked[:2]
+    requested = [names[-1], names[0], names[-1]]
+    recording = open_recording(root, split=write(tmp_path / "split.txt", "\n".join(requested)))
+    assert [f.name for f in recording] == [f.name for f in recording.reopen()] == requested[:2]
     assert len(recording.frames[0].load()) and str(recording).count("2 frames") == 1
     whole = open_recording(root)
-    assert [f.name for f in whole.chosen(names[::-1])] == names[::-1]
-    with pytest.raises(InputError, match=rf"no frame x \(1 such\); its first is {names[0]}"):
-        whole.chosen([names[0], "x"])
+    assert [f.name for f in whole.select(names[::-1])] == names[::-1]
+    with pytest.raises(InputError, match=rf"no frame x \(1 unknown\); its first is {names[0]}"):
+        whole.select([names[0], "x"])
 
 
 @pytest.mark.parametrize("kind, sequences", [
     ("tracking", ("0007", "0000")), ("nuscenes", nuscenes_folder.SCENES[::-1]),
     ("semantickitti", ("08", "00"))])
-def test_a_split_may_name_sequences(tmp_path, kind, sequences):
+def test_split_may_name_sequences(tmp_path, kind, sequences):
     root = MADE[kind][0](tmp_path / kind)
     frames = list(open_recording(root))
     first, second = ([f.name for f in frames if f.sequence == name] for name in sequences)
-    for asked, expected in ((sequences[:1], first), (sequences, first + second),
-                            ((first[-1], *sequences), first[-1:] + first[:-1] + second)):
-        split = write(tmp_path / "split.txt", "\n".join(asked) + "\n")
+    for requested, expected in ((sequences[:1], first), (sequences, first + second),
+                                ((first[-1], *sequences), first[-1:] + first[:-1] + second)):
+        split = write(tmp_path / "split.txt", "\n".join(requested) + "\n")
         assert [f.name for f in open_recording(root, split=split)] == expected
 
 
 @pytest.mark.no_cover
-def test_splits_that_are_wrong_are_named(tmp_path, written):
+def test_invalid_split_is_reported(tmp_path, written):
     for root in (object_folder(tmp_path / "kitti"), written):
         first = next(iter(open_recording(root))).name
-        for text, words in (("", f"names no frame; it needs one a line, such as {first}"),
-                            (f"{first}\nx\ny\n", rf"names x \(2 such\), .* first frame is {first}"),
+        for text, words in (("", f"is empty; it needs one frame per line, such as {first}"),
+                            (f"{first}\nx\ny\n", rf"names x \(2 unknown\), .* frame is {first}"),
                             (b"\xff\xfe\x00", "cannot read the split")):
             with pytest.raises(InputError, match=words) as error:
                 open_recording(root, split=write(tmp_path / "split.txt", text))
@@ -216,12 +217,12 @@ def test_splits_that_are_wrong_are_named(tmp_path, written):
 
 # columns
 
-def test_unusable_returns_go_from_all_columns_alike(tmp_path):
+def test_unusable_returns_are_dropped_from_all_columns(tmp_path):
     xyz = scene().astype(np.float64)[:, :3]
     intensity = np.arange(len(xyz), dtype=np.float32)
     bad = {3: np.nan, 10: np.inf, 11: -np.inf, 20: 0.0, 21: 1e6}
-    for place, value in bad.items():
-        xyz[place] = value
+    for index, value in bad.items():
+        xyz[index] = value
     kept = np.setdiff1d(np.arange(len(xyz)), list(bad))
     before = xyz.copy(), intensity.copy()
     frame = LidarFrame.of(xyz, intensity, 5, "velodyne")
@@ -239,12 +240,12 @@ def test_unusable_returns_go_from_all_columns_alike(tmp_path):
     assert np.array_equal(read.point_truth().instances, kept)
 
 
-def test_poses_of_semantickitti_invert_pose_line_also_of_some_of_the_scans(tmp_path):
+def test_semantickitti_poses_are_those_written(tmp_path):
     frames = open_recording(semantic_folder(tmp_path)).frames
     for frame in frames:
         np.testing.assert_allclose(frame.pose(), drive(int(frame.points.stem)), atol=1e-9)
     stamps = [frame.stamp_ns for frame in frames]
-    assert np.diff(stamps).tolist() == [PERIOD_NS, GAP_NS]  # drives of a bag are told by gaps
+    assert np.diff(stamps).tolist() == [PERIOD_NS, GAP_NS]  # a gap separates drives
     frames[0].points.unlink()
     assert [f.index for f in open_recording(tmp_path)] == [1, 0]
     np.testing.assert_allclose(open_recording(tmp_path).frames[0].pose(), drive(1), atol=1e-9)
@@ -257,7 +258,7 @@ def test_poses_of_semantickitti_invert_pose_line_also_of_some_of_the_scans(tmp_p
         open_recording(tmp_path).frames[-1].pose()
 
 
-def test_a_pipe_in_place_of_a_file_is_refused_without_waiting(tmp_path):
+def test_named_pipe_is_rejected_without_waiting(tmp_path):
     (tmp_path / "bag").mkdir()
     for path in ("bag/bag.mcap", "pipe.bin"):
         os.mkfifo(tmp_path / path)

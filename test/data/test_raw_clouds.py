@@ -1,4 +1,4 @@
-"""Clouds with all their columns come back as they were written, from any file."""
+"""Clouds of any file with all their columns."""
 
 import struct
 
@@ -8,8 +8,8 @@ import pytest
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.data.cloud_files import read_points
 from lidar_perception.data.open import open_recording
-from lidar_perception.data.pcd import read_pcd, unpacked_lzf
-from lidar_perception.data.raw_clouds import open_clouds, spread
+from lidar_perception.data.pcd import decompress_lzf, read_pcd
+from lidar_perception.data.raw_clouds import choose_clouds, open_clouds
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array, to_array
@@ -30,8 +30,8 @@ def points(n=200):
     return made
 
 
-def packed_lzf(data):
-    """A greedy LZF: runs from before where three bytes were seen, else literals."""
+def compress_lzf(data):
+    """Compress with LZF, greedily: copy earlier runs of at least three bytes, else literals."""
     out, literal, seen, i = bytearray(), bytearray(), {}, 0
 
     def flush():
@@ -81,12 +81,12 @@ def pcd(cloud, kind):
     if kind == "binary":
         return head + cloud.tobytes()
     plain = b"".join(np.ascontiguousarray(cloud[name]).tobytes() for name in cloud.dtype.names)
-    data = packed_lzf(plain)
+    data = compress_lzf(plain)
     return head + struct.pack("<II", len(data), len(plain)) + data
 
 
 @pytest.mark.parametrize("kind", ["ascii", "binary", "binary_compressed"])
-def test_a_pcd_file_gives_the_points_that_were_written(tmp_path, kind):
+def test_pcd_file_returns_the_written_points(tmp_path, kind):
     path = tmp_path / "one.pcd"
     path.write_bytes(pcd(points(), kind))
     assert read_pcd(path).dtype.names == points().dtype.names
@@ -98,7 +98,7 @@ def test_a_pcd_file_gives_the_points_that_were_written(tmp_path, kind):
         assert "\n" not in str(error.value)
 
 
-def test_whole_numbers_in_a_text_keep_all_their_digits(tmp_path):
+def test_integers_in_text_keep_all_digits(tmp_path):
     path = tmp_path / "one.pcd"
     for name in ("u1", "i1", "u4", "i8", "u8"):
         limits = np.iinfo(name)
@@ -108,10 +108,10 @@ def test_whole_numbers_in_a_text_keep_all_their_digits(tmp_path):
 
 
 @pytest.mark.parametrize("data", [b"", b"a", b"abc" * 500, bytes(9000), bytes(range(256)) * 40])
-def test_lzf_unpacks_what_was_packed(data):
-    assert unpacked_lzf(packed_lzf(data), len(data)) == data
+def test_lzf_data_are_decompressed(data):
+    assert decompress_lzf(compress_lzf(data), len(data)) == data
     with pytest.raises(ValueError):
-        unpacked_lzf(packed_lzf(data), len(data) + 1)
+        decompress_lzf(compress_lzf(data), len(data) + 1)
 
 
 ONE = "FIELDS x\nSIZE 4\nTYPE F\n"
@@ -124,14 +124,14 @@ ONE = "FIELDS x\nSIZE 4\nTYPE F\n"
         f"FIELDS n\nSIZE {size}\nTYPE {kind}\nPOINTS 1\nDATA ascii\n{number}"
         for size, kind, number in ((1, "U", 256), (2, "U", -1), (1, "I", 128), (8, "U", 2**64),
                                    (8, "I", 2**63)))])
-def test_what_is_no_pcd_file_is_named(tmp_path, text):
+def test_invalid_pcd_file_is_reported(tmp_path, text):
     path = tmp_path / "one.pcd"
     path.write_text(text)
     with pytest.raises(InputError, match=r"one\.pcd"):
         read_pcd(path)
 
 
-def test_folders_of_files_and_kitti_and_nuscenes_records(tmp_path):
+def test_cloud_files_and_folders_are_opened(tmp_path):
     for i in range(3):
         (tmp_path / f"{i}.pcd").write_bytes(pcd(points(50 + i), "binary"))
     clouds = open_clouds(tmp_path)
@@ -139,7 +139,7 @@ def test_folders_of_files_and_kitti_and_nuscenes_records(tmp_path):
     assert [len(to_array(clouds.load(i))) for i in range(3)] == [50, 51, 52]
     assert open_clouds(tmp_path / "1.pcd").count == 1
     rng = np.random.default_rng(0)
-    four = rng.normal(0, 10, (500, 4)).astype(np.float32)  # 8000 bytes: 400 records of five, too
+    four = rng.normal(0, 10, (500, 4)).astype(np.float32)  # as many bytes as 400 records of five
     four[:, 3] = abs(four[:, 3])
     (tmp_path / "a.bin").write_bytes(four.tobytes())
     five = np.column_stack([four, rng.integers(0, 32, 500)]).astype(np.float32)
@@ -148,20 +148,20 @@ def test_folders_of_files_and_kitti_and_nuscenes_records(tmp_path):
     assert a.dtype.names == ("x", "y", "z", "intensity")
     assert b.dtype.names == (*a.dtype.names, "ring")
     assert np.array_equal(a["z"], four[:, 2]) and np.array_equal(b["ring"], five[:, 4])
-    with pytest.raises(InputError, match="there is no"):
+    with pytest.raises(InputError, match="does not exist"):
         open_clouds(tmp_path / "none")
 
 
 @pytest.mark.parametrize("more", [("time",), ("ring", "time"), ("r", "g", "b")])
-def test_records_of_other_columns_are_no_cloud_that_is_made_up_of_them(tmp_path, more):
+def test_records_with_other_columns_are_rejected(tmp_path, more):
     rng = np.random.default_rng(0)
     cloud = np.column_stack([rng.normal(0, 10, (400, 3)), rng.random((400, 1 + len(more)))])
     (tmp_path / "one.bin").write_bytes(cloud.astype(np.float32).tobytes())
-    with pytest.raises(InputError, match=r"one\.bin is not of the columns .* save it as \.pcd"):
+    with pytest.raises(InputError, match=r"one\.bin does not have the columns .* save it as \.pcd"):
         read_points(tmp_path / "one.bin")
 
 
-def in_a_bag(n):
+def make_bag_points(n):
     made = points(n)
     layout = [(name, kind) for name, kind, *_ in LAYOUT[:5]]
     cloud = np.empty(n, layout)
@@ -177,23 +177,24 @@ def write(path, topics, count=4):
         for i in range(count):
             for topic in topics:
                 header = header_message(i * 10**8, topic.strip("/"), bag_message)
-                bag.write(topic, i * 10**8, from_array(in_a_bag(90 + i), header, bag_message))
+                message = from_array(make_bag_points(90 + i), header, bag_message)
+                bag.write(topic, i * 10**8, message)
 
 
-def test_a_bag_of_one_sensor_is_read_and_of_several_the_one_that_is_named(tmp_path):
+def test_bag_with_several_sensors_needs_a_topic(tmp_path):
     write(tmp_path / "one", ["/front/scan"])
     clouds = open_clouds(tmp_path / "one")
     assert clouds.count == 4 and clouds.stamps_ns.tolist() == [0, 10**8, 2 * 10**8, 3 * 10**8]
-    assert np.array_equal(to_array(clouds.load(2)), in_a_bag(92))
+    assert np.array_equal(to_array(clouds.load(2)), make_bag_points(92))
     write(tmp_path / "three", ["/left", "/right", "/rear"])
-    with pytest.raises(InputError, match="on /left, /rear, /right; name"):
+    with pytest.raises(InputError, match="on /left, /rear, /right; choose"):
         open_clouds(tmp_path / "three")
     assert open_clouds(tmp_path / "three", "/rear").load(1).header.frame_id == "rear"
     with pytest.raises(InputError, match="no topic /other"):
         open_clouds(tmp_path / "three", "/other")
 
 
-def test_files_that_are_named_by_times_have_these_as_stamps(tmp_path):
+def test_times_in_file_names_are_stamps(tmp_path):
     for name in ("1700000000.1", "1700000000.2"):
         (tmp_path / f"{name}.pcd").write_bytes(pcd(points(), "ascii"))
     clouds = open_clouds(tmp_path)
@@ -205,8 +206,8 @@ def test_files_that_are_named_by_times_have_these_as_stamps(tmp_path):
 
 @pytest.mark.parametrize("names, timed", [
     (["1700000000.1", "1700000000.19998", "1700000000.4", "1700000001"], True),  # str(time)
-    (["0000000000", "0000000001", "0000000010"], False)])  # KITTI's numbers of frames
-def test_files_are_in_the_order_of_time_and_a_number_is_no_time(names, timed, tmp_path):
+    (["0000000000", "0000000001", "0000000010"], False)])  # KITTI's frame numbers
+def test_files_are_in_order_of_time_or_number(names, timed, tmp_path):
     for name in reversed(names):
         (tmp_path / f"{name}.pcd").write_bytes(pcd(points(), "ascii"))
     recording = open_recording(tmp_path)
@@ -216,14 +217,14 @@ def test_files_are_in_the_order_of_time_and_a_number_is_no_time(names, timed, tm
     assert timed == (stamps[-1] == 1_700_000_001 * 10**9)
 
 
-def test_scans_are_looked_at_in_pairs_spread_over_all():
-    assert spread(5, 10) == [0, 1, 2, 3, 4]
-    chosen = spread(1000, 40)
+def test_clouds_are_chosen_in_evenly_spread_pairs():
+    assert choose_clouds(5, 10) == [0, 1, 2, 3, 4]
+    chosen = choose_clouds(1000, 40)
     assert len(chosen) == 40 and chosen[:2] == [0, 1] and chosen[-1] == 999
     assert np.diff(chosen)[::2].tolist() == [1, 8] * 10 and (np.diff(chosen)[1::2] > 40).all()
-    assert spread(3, 1) == [0] and spread(1, 1) == [0]
+    assert choose_clouds(3, 1) == [0] and choose_clouds(1, 1) == [0]
     for count in range(1, 60):
         for wanted in range(1, 45):
-            chosen = spread(count, wanted)
+            chosen = choose_clouds(count, wanted)
             assert chosen == sorted({*chosen}) and chosen[0] == 0 and chosen[-1] < count
             assert len(chosen) <= wanted and (count == 1 or len(chosen) > 1 or wanted == 1)

@@ -1,4 +1,4 @@
-"""The intensity of every source is read in one scale, the same for all frames, in any order."""
+"""Intensity scale of recordings: the same for all frames, in any order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from samples import STAMP, calibration_text, write
 
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.levelled import Robot, levelled
+from lidar_perception.data.levelled import SensorMount, level_frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.semantickitti import write_scan
 from lidar_perception.data.to_bag import write_bag
@@ -22,7 +22,7 @@ COUNT = 5
 
 
 def clouds(full, whole=False):
-    """Frames of (50, 4) [x y z intensity], the first of them dark, of a sensor with this scale."""
+    """Yield clouds (50, 4) [x y z intensity] of a sensor with this scale; the first one is dark."""
     rng = np.random.default_rng(0)
     for i in range(COUNT):
         cloud = rng.uniform([3, -9, -1, 0], [30, 9, 1, 1], (50, 4))
@@ -86,7 +86,7 @@ LAYOUTS = {each.__name__: each for each in (object_files, tracking_files, raw_fi
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("full, whole", [(1, False), (100, False), (255, False), (255, True),
                                          (1023, True), (65535, True)])
-def test_all_frames_are_read_in_one_scale_in_any_order(tmp_path, layout, full, whole):
+def test_scale_is_the_same_for_all_frames_in_any_order(tmp_path, layout, full, whole):
     LAYOUTS[layout](tmp_path, clouds(full, whole))
     path = tmp_path / "drive" if layout == "bag" else tmp_path
     expected = [cloud[:, 3] / np.float32(full) for _, cloud in clouds(full, whole)]
@@ -97,9 +97,9 @@ def test_all_frames_are_read_in_one_scale_in_any_order(tmp_path, layout, full, w
             assert scan.intensity.tobytes() == expected[i].tobytes()
             assert frames[i].intensity_max() == full
     assert np.array_equal(next(iter(open_recording(path))).load().intensity, expected[0])
-    if layout in ("bin_files", "pcd_files", "bag"):  # as convert --robot reads them
-        assert np.array_equal(levelled(frames[0], Robot()).load().intensity, expected[0])
-        given = levelled(frames[0], Robot(intensity_max=10.0)).load().intensity
+    if layout in ("bin_files", "pcd_files", "bag"):  # for convert --robot
+        assert np.array_equal(level_frame(frames[0], SensorMount()).load().intensity, expected[0])
+        given = level_frame(frames[0], SensorMount(intensity_max=10.0)).load().intensity
         assert np.allclose(given, expected[0] * full / 10)
 
 
@@ -107,7 +107,7 @@ def test_all_frames_are_read_in_one_scale_in_any_order(tmp_path, layout, full, w
     ("u1", [0, 3, 90], 255), ("<u2", [0, 3, 200], 255), ("<u2", [0, 3, 3000], 4095),
     ("<u2", [0, 3, 60000], 65535), ("<f4", [np.nan, -1, 0.5], 1), ("<f4", [0, 0, 0], 1),
     ("<f8", [7, 7, 7], 255)])
-def test_the_type_of_a_recorded_field_counts(tmp_path, kind, values, full):
+def test_scale_depends_on_the_type_of_the_field(tmp_path, kind, values, full):
     points = np.ones(3, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("reflectivity", kind)])
     points["reflectivity"] = values
     with BagWriter(tmp_path / "drive") as writer:
@@ -120,7 +120,7 @@ def test_the_type_of_a_recorded_field_counts(tmp_path, kind, values, full):
         assert np.array_equal(frame.load().intensity, expected / np.float32(full))
 
 
-def test_empty_and_black_clouds_at_the_start_of_a_bag_do_not_decide_on_the_scale(tmp_path):
+def test_empty_and_black_clouds_do_not_affect_the_scale(tmp_path):
     xyz = np.ones((50, 3))
     first = [np.zeros((0, 4), np.float32), np.column_stack([xyz, np.zeros(50)])] * 8
     rest = [cloud for _, cloud in clouds(255)]
@@ -131,7 +131,7 @@ def test_empty_and_black_clouds_at_the_start_of_a_bag_do_not_decide_on_the_scale
     assert not frames[1].load().intensity.any() and frames[-1].load().intensity.max() == 1.0
 
 
-def test_a_broken_cloud_does_not_decide_on_the_scale(tmp_path):
+def test_invalid_cloud_does_not_affect_the_scale(tmp_path):
     object_files(tmp_path, clouds(255))
     write(tmp_path / "training/velodyne/000004.bin", b"cut")
     frames = open_recording(tmp_path).frames
@@ -140,7 +140,7 @@ def test_a_broken_cloud_does_not_decide_on_the_scale(tmp_path):
     assert frames[0].load().intensity.max() == np.float32(1.2) / np.float32(255)
 
 
-def test_commands_say_the_scale_and_export_0_to_1(tmp_path, monkeypatch, capfd):
+def test_commands_report_the_scale_and_export_0_to_1(tmp_path, monkeypatch, capfd):
     object_files(tmp_path / "own", clouds(255))
     assert exit_of(monkeypatch, "convert", tmp_path / "own", "--out", tmp_path / "own.bag") == 0
     assert "its intensity is 0 .. 255, read as 0 .. 1" in capfd.readouterr().err
@@ -150,6 +150,6 @@ def test_commands_say_the_scale_and_export_0_to_1(tmp_path, monkeypatch, capfd):
     dark = np.tile(next(clouds(0.01))[1], (30, 1))
     object_files(tmp_path / "dark", [(0, dark)])
     assert exit_of(monkeypatch, "convert", tmp_path / "dark", "--out", tmp_path / "dark.bag") == 0
-    said = " ".join(capfd.readouterr().err.split())
-    assert "intensity goes up to 0.01 where 1 is" in said and "input.intensity_max" in said
+    output = " ".join(capfd.readouterr().err.split())
+    assert "intensity goes up to 0.01 where 1 is" in output and "input.intensity_max" in output
 

@@ -1,4 +1,4 @@
-"""A bag of ROS 1 is read as the same bag of ROS 2."""
+"""ROS 1 bags are read like ROS 2 bags."""
 
 import shutil
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.no_cover  # others run these lines
 
 
 @pytest.mark.parametrize("compress", [None, "lz4"])
-def test_clouds_labels_and_camera_are_those_of_the_same_bag_of_ros_2(drive_bag, tmp_path, compress):
+def test_ros1_bag_equals_the_ros2_bag(drive_bag, tmp_path, compress):
     ours = open_recording(drive_bag)
     theirs = open_recording(as_ros1(drive_bag, tmp_path / "drive.bag", compress))
     assert theirs.has == ours.has and len(theirs) == len(ours)
@@ -35,17 +35,17 @@ def test_clouds_labels_and_camera_are_those_of_the_same_bag_of_ros_2(drive_bag, 
                                   open_clouds(drive_bag).load(len(ours) - 1).data)
 
 
-def test_a_folder_of_such_a_name_is_a_bag_of_ros_2(drive_bag, tmp_path):
+def test_folder_named_bag_is_a_ros2_bag(drive_bag, tmp_path):
     shutil.copytree(drive_bag, tmp_path / "drive.bag")
     assert "rosbag2 bag" in str(open_recording(tmp_path / "drive.bag"))
 
 
-def test_poses_of_a_robot_come_from_its_odometry_and_tf(tmp_path):
+def test_poses_come_from_odometry_and_tf(tmp_path):
     recorded(tmp_path / "robot", moving(ODOMETRY), mount())
     check(open_recording(as_ros1(tmp_path / "robot", tmp_path / "robot.bag", "bz2")))
 
 
-def test_the_old_name_of_tf_latched_topics_and_foreign_types(tmp_path):
+def test_old_tf_name_latched_topics_and_unknown_types_are_read(tmp_path):
     store = get_typestore(Stores.ROS1_NOETIC)
     for kind in ("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage", "driver_msgs/msg/Packet"):
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
@@ -55,12 +55,12 @@ def test_the_old_name_of_tf_latched_topics_and_foreign_types(tmp_path):
                                      ("/tf_static", "tf2_msgs/msg/TFMessage", 1),
                                      ("/packets", "driver_msgs/msg/Packet", 0)):
             connection = bag.add_connection(topic, kind, typestore=store, latching=latched)
-            each = stamped.transforms[0]
+            ros2 = stamped.transforms[0]
             header = store.types["std_msgs/msg/Header"](
-                seq=7, stamp=each.header.stamp, frame_id=each.header.frame_id)
-            each = type(each)(header=header, child_frame_id="b", transform=each.transform)
+                seq=7, stamp=ros2.header.stamp, frame_id=ros2.header.frame_id)
+            ros1 = type(ros2)(header=header, child_frame_id="b", transform=ros2.transform)
             bag.write(connection, 5, store.serialize_ros1(
-                store.types[kind](transforms=[each]), kind))
+                store.types[kind](transforms=[ros1]), kind))
     with Bag(tmp_path / "old.bag") as bag:
         assert set(bag.topics.values()) == {"tf2_msgs/msg/TFMessage"}
         assert bag.counts == {"/tf": 1, "/tf_static": 1}
@@ -69,7 +69,7 @@ def test_the_old_name_of_tf_latched_topics_and_foreign_types(tmp_path):
             assert time == 5 and msg.transforms[0].child_frame_id == "b"
 
 
-def test_a_damaged_one_is_named_in_one_line(drive_bag, tmp_path):
+def test_damaged_bag_is_reported_in_one_line(drive_bag, tmp_path):
     whole = as_ros1(drive_bag, tmp_path / "whole.bag").read_bytes()
     rng = np.random.default_rng(0)
     (tmp_path / "text.bag").write_bytes(b"text " * 100)
@@ -81,7 +81,7 @@ def test_a_damaged_one_is_named_in_one_line(drive_bag, tmp_path):
         assert "\n" not in str(error.value) and path.name in str(error.value)
 
 
-def test_a_bag_of_sensor_packets_names_the_driver_that_makes_clouds_of_them(tmp_path):
+def test_sensor_packets_are_reported_with_their_driver(tmp_path):
     store = get_typestore(Stores.ROS1_NOETIC)
     kind = "velodyne_msgs/msg/VelodyneScan"
     store.register(get_types_from_msg("uint8[] packets", kind))

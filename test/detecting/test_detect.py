@@ -20,11 +20,11 @@ from samples import STAMP, object_folder, scene, walker_label, write
 
 from lidar_perception.camera import FORWARD_CAMERA
 from lidar_perception.data.bag import Bag
-from lidar_perception.data.frame import Frame, Recording, nothing
+from lidar_perception.data.frame import Frame, Recording, return_none
 from lidar_perception.data.kitti.results import (
+    choose_calibration,
     read_results,
     read_tracking_results,
-    result_calibration,
 )
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
@@ -90,7 +90,7 @@ def test_any_recording_gives_a_result_of_every_frame(kind, tmp_path, monkeypatch
         expected = MadeDetector()(frame.load()).detections
         np.testing.assert_array_equal(np.float32(found[frame.name]), np.column_stack([
             expected.class_ids, expected.scores, expected.boxes]).astype(np.float32))
-        camera = result_calibration(frame)[0].lidar_to_camera
+        camera = choose_calibration(frame)[0].lidar_to_camera
         back = read_results(out / f"kitti/{frame.name}.txt", camera)
         np.testing.assert_allclose(back.boxes[:, :6], expected.boxes[:, :6], atol=2e-4)
         assert [e["score"] for e in back.extras] == pytest.approx(expected.scores, abs=1e-4)
@@ -174,7 +174,7 @@ def made_run(recording, out, **header):
 def test_written_results_score_as_the_detector_itself(kitti, tmp_path, monkeypatch, camera, capsys):
     write(kitti / "training/velodyne/000002.bin", b"123")  # which is skipped by both
     if not camera:
-        frames = [replace(frame, calibration=nothing) for frame in open_recording(kitti)]
+        frames = [replace(frame, calibration=return_none) for frame in open_recording(kitti)]
         kitti = tmp_path / "bag"
         write_bag(kitti, frames, skipped=[])
     out, asked = tmp_path / "out", ("--min-score", 0.001)

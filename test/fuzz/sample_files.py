@@ -19,7 +19,7 @@ from lidar_perception.candidates.configurations import BEST_VALUES
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti import write as kitti
 from lidar_perception.data.open import open_recording
-from lidar_perception.data.semantickitti import calibration_text, pose_line, write_scan
+from lidar_perception.data.semantickitti import format_calibration, format_pose, write_scan
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labels.drive_labels import DriveLabels, of_truth
 from lidar_perception.labels.exchange import export_labels
@@ -49,12 +49,12 @@ def write_samples(root: Path) -> None:
                    np.full(len(street(i)), 40, np.uint32), np.zeros(len(street(i)), np.uint32))
     tracking = root / "tracking/training"
     write_text(tracking / "label_02/0000.txt", "".join(
-        kitti.tracking_label_text(i, TRUTH, FORWARD_CAMERA) for i in range(FRAMES)).strip())
-    write_text(tracking / "calib/0000.txt", kitti.calibration_text(FORWARD_CAMERA))
+        kitti.format_tracking_labels(i, TRUTH, FORWARD_CAMERA) for i in range(FRAMES)).strip())
+    write_text(tracking / "calib/0000.txt", kitti.format_calibration(FORWARD_CAMERA))
     sequence = root / "semantickitti/sequences/00"
-    write_text(sequence / "poses.txt", pose_line(np.eye(4), FORWARD_CAMERA) * FRAMES)
+    write_text(sequence / "poses.txt", format_pose(np.eye(4), FORWARD_CAMERA) * FRAMES)
     write_text(sequence / "times.txt", "0.0\n0.1")
-    write_text(sequence / "calib.txt", calibration_text(FORWARD_CAMERA))
+    write_text(sequence / "calib.txt", format_calibration(FORWARD_CAMERA))
     write_bag(root / "bag/drive", [Frame.of(str(i), LidarFrame(
         street(i), np.full(len(street(i)), 0.4, np.float32), STAMP + i * 10**8, "lidar"), TRUTH,
         FORWARD_CAMERA, pose=lambda: np.eye(4)) for i in range(FRAMES)])
@@ -68,7 +68,7 @@ def write_samples(root: Path) -> None:
     _write_foreign(root)
     (root / "ros1").mkdir()
     as_ros1(root / "bag/drive", root / "ros1/drive.bag", "lz4")
-    nuscenes_folder.save(root / "nuscenes", nuscenes_folder.made_tables(
+    nuscenes_folder.save(root / "nuscenes", nuscenes_folder.make_tables(
         frames=FRAMES, objects=2, scenes=nuscenes_folder.SCENES[:1]))
     labels = (root / "kitti/training/label_2/000000.txt").read_text()
     for i in range(FRAMES):
@@ -104,9 +104,9 @@ def _write_foreign(root: Path) -> None:
     ).encode() + cloud.astype(">f4").tobytes())
     sequence = root / "odometry/dataset/sequences/00"
     kitti.write_velodyne(sequence / "velodyne/000000.bin", cloud)
-    write_text(sequence / "calib.txt", calibration_text(FORWARD_CAMERA))
+    write_text(sequence / "calib.txt", format_calibration(FORWARD_CAMERA))
     write_text(sequence / "times.txt", "0.0")
-    write_text(root / "odometry/dataset/poses/00.txt", pose_line(np.eye(4), FORWARD_CAMERA))
+    write_text(root / "odometry/dataset/poses/00.txt", format_pose(np.eye(4), FORWARD_CAMERA))
     kitti.write_velodyne(root / "raw/velodyne_points/data/0000000000.bin", cloud)
     write_text(root / "raw/velodyne_points/timestamps.txt", "2011-09-26 13:02:25.594360375")
     write_text(root / "raw/frame_list.txt", "0 0000000000")

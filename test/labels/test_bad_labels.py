@@ -53,8 +53,8 @@ WRONG = [  # format, what is put in place of what, what is said
     ("nuscenes-detection", "[1, 2, 3]", "[1, 2, NaN]", "sample 0000/000005, box 1 of 1"),
     ("nuscenes-detection", "[1, 0, 0, 0]", "[0, 0, 0, 0]", "cannot be read"),
     ("nuscenes-detection", "0000/000005", "other", "has none of the drive's samples"),
-    ("kitti", "3.9", "nan", "000005.txt:1 is no KITTI label"),
-    ("kitti", "Car 0", "Car 1e308", "000005.txt:1 is no KITTI label"),
+    ("kitti", "3.9", "nan", "000005.txt:1 is not a KITTI label"),
+    ("kitti", "Car 0", "Car 1e308", "000005.txt:1 is not a KITTI label"),
     ("kitti-tracking", "5 1 Car", "51 1 Car", "0000.txt:1 is of frame 51, and the drive has 5"),
 ]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cli_samples import error_line, exit_of
 from format_samples import CALIBRATION, drive, labels_of, pose, same
-from nuscenes_folder import made_tables, save
+from nuscenes_folder import make_tables, save
 from robot_bags import ON_BASE, base_at, mount, moving, moving_tf, recorded, stamps
 from samples import DATA, needs_data
 
@@ -83,7 +83,7 @@ def test_a_simulated_data_set_comes_back_from_its_bag(layout, made, tmp_path):
 @pytest.mark.parametrize("folder", REAL)
 def test_a_real_data_set_comes_back_from_its_bag(folder, tmp_path):
     recording = open_recording(DATA / folder)
-    recording = recording.chosen([frame.name for frame in recording.frames[:4]])
+    recording = recording.select([frame.name for frame in recording.frames[:4]])
     write_bag(tmp_path / "bag", recording)
     write_dataset(REAL[folder], open_recording(tmp_path / "bag"), tmp_path / "back")
     same_frames(recording, open_recording(tmp_path / "back"))
@@ -129,7 +129,7 @@ def frames_at(seconds, **more):
 def test_labels_of_a_vehicle_that_leans_come_back_from_nuscenes_as_they_were(kind, tmp_path):
     """Its boxes are upright in the global frame, ours in the vehicle's; what was not moved is
     written as it was read."""
-    tables = made_tables(frames=2, objects=8, scenes=("scene-0001",))
+    tables = make_tables(frames=2, objects=8, scenes=("scene-0001",))
     recording = open_recording(save(tmp_path / "there", tables))
     if kind == "tables":
         write_dataset("nuscenes", recording, tmp_path / "back")

@@ -285,15 +285,15 @@ def test_a_split_leaves_out_all_else(few, tmp_path):
     (few / "training/velodyne/000004.bin").unlink()
     split = write(tmp_path / "split.txt", "000002\n000000\n")
     whole = open_recording(few)
-    assert [name for name, _ in whole.lost] == ["000004"]
+    assert [name for name, _ in whole.missing_scans] == ["000004"]
     records = runner.run(SMALL, open_recording(few, split=split), tmp_path / "out")
     assert [(r["frame"], "skipped" in r) for r in records] == [("000002", False), ("000000", False)]
     assert [r["frame"] for r in runner.run(SMALL, whole, tmp_path / "all")][-1] == "000004"
 
 
 def test_a_folder_without_scans_or_pedestrians_is_an_error(tmp_path):
-    for argument, words in ((tmp_path / "none", "there is no "),
-                            (tmp_path, "is no recording that can be read")):
+    for argument, words in ((tmp_path / "none", "does not exist"),
+                            (tmp_path, "is not a recording in a supported format")):
         with pytest.raises(InputError, match=words):
             command("--data", argument, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -57,7 +57,7 @@ def start(processes, bag, **params):
 def test_bytes_arrive_as_they_are_in_the_bag(processes, peer, drive_bag, tmp_path, ros):
     played = drive_bag if ros == 2 else as_ros1(drive_bag, tmp_path / "drive.bag")
     with Bag(drive_bag) as bag:
-        expected = {t: [d for topic, _, d in bag.raw({t})] for t in (POINTS, TRUTH)}
+        expected = {t: [d for topic, _, d in bag.raw_messages({t})] for t in (POINTS, TRUTH)}
     received = {POINTS: peer.listen_raw(POINTS, CLOUD),
                 TRUTH: peer.listen_raw(TRUTH, "visualization_msgs/msg/MarkerArray")}
     info = peer.listen(CAMERA_INFO, INFO, LATCHED)
@@ -153,7 +153,8 @@ def test_a_wrong_metadata_is_a_warning_and_the_bag_is_played(start, text_bag, tm
     player.serve = lambda timeout_sec: None
     player._play_once()
     assert len(player.sent["text"]) == 20
-    assert capfd.readouterr().err.count("metadata.yaml is wrong: it says a start of") == 1
+    warning = "metadata.yaml does not match the bag: it declares a start of"
+    assert capfd.readouterr().err.count(warning) == 1
 
 
 def test_a_topic_of_several_publishers_is_offered_as_the_best_of_them_did():

@@ -219,6 +219,6 @@ def test_bad_input_is_one_line(case, bare, tmp_path, monkeypatch, capsys):
         arguments += ["--weights", tmp_path / "w"]
         expected = f"there is no checkpoint {tmp_path / 'w'}"
     else:
-        arguments, expected = ["--data", tmp_path / "none"], f"there is no {tmp_path / 'none'}"
+        arguments, expected = ["--data", tmp_path / "none"], f"{tmp_path / 'none'} does not exist"
     assert exit_of(monkeypatch, "compare", *arguments) == 2
     assert expected in error_line(capsys)

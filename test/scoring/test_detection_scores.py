@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import CALIBRATION
 
-from lidar_perception.data.kitti.labels import parse, to_ground_truth
-from lidar_perception.data.kitti.write import image_boxes
+from lidar_perception.data.kitti.labels import parse_label, to_ground_truth
+from lidar_perception.data.kitti.write import project_boxes
 from lidar_perception.scoring.average_precision import at_recall, averages, recall_thresholds
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.scores import CentreScores
@@ -30,7 +30,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def labels(text):
-    return to_ground_truth([parse(line) for line in text.splitlines()],
+    return to_ground_truth([parse_label(line) for line in text.splitlines()],
                            CALIBRATION.lidar_to_camera)
 
 
@@ -171,7 +171,7 @@ def test_what_must_be_found(change, counted):
 def test_truncation_of_tracks_is_computed_and_their_level_is_no_share():
     inside = np.array([20.0, 0, -0.9, 3.9, 1.6, 1.5, 0.2])
     across = np.array([7.0, 6.3, -0.9, 3.9, 1.6, 1.5, 0.2])
-    share = image_boxes(across[None], CALIBRATION)[1][0]
+    share = project_boxes(across[None], CALIBRATION)[1][0]
     assert 0.3 < share < 0.95
     extras = [{"track_id": 1, "truncated": 0.0}, {"track_id": 2, "truncated": 1.0},
               {"track_id": 3, "truncated": 0.0}, {"track_id": 4, "truncated": 2.0},
@@ -193,7 +193,7 @@ def test_what_a_label_does_not_say_is_computed_from_its_box():
     np.testing.assert_allclose(said.alpha, 0.3 - np.arctan2(x, z), atol=1e-9)
     np.testing.assert_allclose(bare.alpha, said.alpha, atol=1e-3)  # the camera is tilted
     np.testing.assert_allclose(bare.image_boxes,
-                               image_boxes(labels(text).boxes, CALIBRATION)[0], atol=1e-9)
+                               project_boxes(labels(text).boxes, CALIBRATION)[0], atol=1e-9)
 
 
 @few

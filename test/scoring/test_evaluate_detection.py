@@ -230,7 +230,7 @@ def test_a_scan_that_was_cut_is_skipped_and_one_that_is_refused_is_missed(kitti,
     write(kitti / "training/velodyne/000001.bin", b"123")
     content, text = evaluate(tmp_path, "--data", kitti, "--weights", "w")
     line, = content["skipped"]
-    assert "000001.bin" in line and "was cut" in line and "skipped" in text
+    assert "000001.bin" in line and "is truncated" in line and "skipped" in text
     assert content["frames"] == 1
 
     def refuse(frame):
@@ -255,11 +255,11 @@ def test_a_split_says_which_frames_are_scored(kitti, found, tmp_path):
 
 
 BAD = {
-    "columns": (f"{PERSON} 0.9\n\n{WHOLE} 0.8 7\n", "000000.txt:3 is no KITTI label"),
-    "words": (PERSON.replace("1.80", "tall") + " 0.9", "000000.txt:1 is no KITTI label"),
-    "score": (f"{PERSON} 0.9\n{WHOLE}", "000000.txt:2 is no result"),
-    "too large": (f"{PERSON} 1e308", "000000.txt:1 is no KITTI label"),
-    "nan": (f"{PERSON} nan", "000000.txt:1 is no KITTI label"),
+    "columns": (f"{PERSON} 0.9\n\n{WHOLE} 0.8 7\n", "000000.txt:3 is not a KITTI label"),
+    "words": (PERSON.replace("1.80", "tall") + " 0.9", "000000.txt:1 is not a KITTI label"),
+    "score": (f"{PERSON} 0.9\n{WHOLE}", "000000.txt:2 is not a result"),
+    "too large": (f"{PERSON} 1e308", "000000.txt:1 is not a KITTI label"),
+    "nan": (f"{PERSON} nan", "000000.txt:1 is not a KITTI label"),
     "class": (f"{PERSON} 0.9".replace("Pedestrian", "Walker"),
               "000000.txt:1 has the unknown class 'Walker'"),
     "bytes": (b"\xff\xfe\x00", "cannot read the labels"),
@@ -282,10 +282,10 @@ def test_what_is_missing_is_named(kitti, found, tmp_path, monkeypatch, capsys):
     assert "cannot read the split" in error("--results", found, "--split", tmp_path / "none")
     split = write(tmp_path / "split.txt", "000001 000007 000008")
     line = error("--results", found, "--split", split)
-    assert "names 000007 (2 such)" in line and str(kitti) in line
+    assert "names 000007 (2 unknown)" in line and str(kitti) in line
     assert "names no frame" in error("--results", found, "--split", write(split, "\n"))
     (found / "000001.txt").unlink()
-    assert f"no result file {found / '000001.txt'}" in error("--results", found)
+    assert f"result file {found / '000001.txt'} does not exist" in error("--results", found)
     write(kitti / "training/label_2/000000.txt", "Car 1 2 3")
     write(kitti / "training/label_2/000001.txt", "Car 1 2 3")
     assert "no frame with labels" in (line := error("--results", found)) and "000000.txt:1" in line

@@ -17,8 +17,8 @@ from lidar_perception.cli.main import cli
 from lidar_perception.data.nuscenes.boxes import NAMES, GlobalBoxes
 from lidar_perception.data.nuscenes.folder import open_nuscenes
 from lidar_perception.data.nuscenes.results import (
-    DETECTED,
     MAX_BOXES,
+    NAME_BY_CLASS,
     read_results,
     to_results,
     write_results,
@@ -30,7 +30,7 @@ from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.scoring.nuscenes.report import OURS
 from lidar_perception.types import CLASSES, Detections, InputError
 
-TABLES = folder.made_tables(seed=2, frames=4, objects=60)
+TABLES = folder.make_tables(seed=2, frames=4, objects=60)
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def root(tmp_path):
 def detections(frame, seed=0):
     """What is there of the classes that detectors know, a little off, and a Van."""
     truth, rng = frame.truth(), np.random.default_rng(seed)
-    kept = np.isin(truth.class_ids, [CLASSES.index(name) for name in DETECTED])
+    kept = np.isin(truth.class_ids, [CLASSES.index(name) for name in NAME_BY_CLASS])
     kept &= np.array([extras["points"] > 0 for extras in truth.extras])
     near = truth.boxes[kept] + rng.normal(0, 0.05, 7)
     ids = truth.class_ids[kept]
@@ -175,8 +175,8 @@ def test_a_version_without_labels_is_written_and_not_scored(tmp_path, detector, 
 
 
 @pytest.mark.parametrize("text, words", [
-    (None, "cannot read the results"), ("{", "is no JSON file"),
-    ("[" * 100_000, "is no JSON file"), ("[]", "has no 'results'"),
+    (None, "cannot read the results"), ("{", "is not a JSON file"),
+    ("[" * 100_000, "is not a JSON file"), ("[]", "has no 'results'"),
     ('{"results": []}', "has no 'results'")])
 def test_files_that_are_no_results_are_named(root, tmp_path, monkeypatch, capsys, text, words):
     path = tmp_path / "r.json"
@@ -204,7 +204,7 @@ def test_scene_files_that_are_wrong_are_named(root, tmp_path, monkeypatch, capsy
     scenes.write_text("\n")
     assert "names no frame" in error(scenes)
     scenes.write_text("scene-0103\nscene-9999\n")
-    assert "names scene-9999 (1 such)" in error(scenes)
+    assert "names scene-9999 (1 unknown)" in error(scenes)
 
 
 @pytest.mark.parametrize("made, config", [(detection_samples, detection_samples.tiny()),

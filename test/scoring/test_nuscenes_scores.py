@@ -25,7 +25,7 @@ from lidar_perception.scoring.nuscenes.protocol import (
 from lidar_perception.scoring.nuscenes.report import OURS, NuscenesReport, key_frame
 from lidar_perception.types import InputError
 
-TABLES = folder.made_tables(seed=2, frames=4, objects=60)
+TABLES = folder.make_tables(seed=2, frames=4, objects=60)
 ERRORS = dict(zip(("ate", "ase", "aoe", "ave", "aae"), reference.ERRORS))
 
 
@@ -187,8 +187,8 @@ def close_to_reference(content, by_class, over):
     (0, 2, 20, 0.1), (1, 3, 60, 0.4), (2, 5, 150, 0.4), (3, 4, 90, 1.0)])
 @pytest.mark.no_cover
 def test_the_same_as_a_second_reading(tmp_path, seed, frames, objects, noise):
-    tables = folder.made_tables(seed, frames, objects)
-    results = folder.made_results(tables, CATEGORIES, seed + 10, noise)
+    tables = folder.make_tables(seed, frames, objects)
+    results = folder.make_results(tables, CATEGORIES, seed + 10, noise)
     by_class, over = reference.evaluate(tables, results, CATEGORIES)
     content = reported(folder.save(tmp_path, tables, sweeps=False), results)
     assert content["frames"] == 2 * frames and 0 < content["all"]["map"] < 100
@@ -200,8 +200,8 @@ def test_the_same_as_nuscenes_devkit(tmp_path, seed, ties):
     module = pytest.importorskip("nuscenes.eval.detection.evaluate", reason="needs nuscenes-devkit")
     from nuscenes import NuScenes
     from nuscenes.eval.common.config import config_factory
-    tables = folder.made_tables(seed, 8, 100)
-    results = folder.made_results(tables, CATEGORIES, seed)
+    tables = folder.make_tables(seed, 8, 100)
+    results = folder.make_results(tables, CATEGORIES, seed)
     for box in itertools.chain(*results.values()) if ties else ():
         box["detection_score"] = round(box["detection_score"], 1)
     content = reported(folder.save(tmp_path, tables, sweeps=False), results)
@@ -223,7 +223,7 @@ def test_the_same_as_nuscenes_devkit(tmp_path, seed, ties):
 
 
 def test_turning_and_moving_the_world_changes_nothing(tmp_path):
-    results = folder.made_results(TABLES, CATEGORIES)
+    results = folder.make_results(TABLES, CATEGORIES)
     before = reported(folder.save(tmp_path / "a", TABLES, sweeps=False), results)
     tables, turn = copy.deepcopy(TABLES), folder.Rotation.from_euler("z", 1.1)
     moved = copy.deepcopy(results)
@@ -239,7 +239,7 @@ def test_turning_and_moving_the_world_changes_nothing(tmp_path):
 
 
 def test_ap_depends_on_the_order_of_scores_only(tmp_path):
-    root, results = folder.save(tmp_path, TABLES, sweeps=False), folder.made_results(
+    root, results = folder.save(tmp_path, TABLES, sweeps=False), folder.make_results(
         TABLES, CATEGORIES)
     before = reported(root, results)
     for rows in results.values():
@@ -258,7 +258,7 @@ def spoil(**values):
 
 
 @pytest.mark.parametrize("change, words", [
-    (lambda r: r.pop("s0k1"), "no boxes of scene-0103/01, sample s0k1 (1 of 8 such)"),
+    (lambda r: r.pop("s0k1"), "no boxes for scene-0103/01, sample s0k1 (missing: 1 of 8 frames)"),
     (lambda r: r.update(s0k0=r["s0k0"] * 100), "at most 500 boxes"),
     (lambda r: r.update(s0k0={}), "needs a list"),
     (lambda r: r["s0k0"][0].pop("size"), "a box has no 'size'"),
@@ -272,7 +272,7 @@ def spoil(**values):
     (spoil(rotation=[1e308, 0, 0, 0]), "a quaternion"),
 ])
 def test_results_that_are_wrong_are_named(tmp_path, change, words):
-    results = folder.made_results(TABLES, CATEGORIES)
+    results = folder.make_results(TABLES, CATEGORIES)
     change(results)
     with pytest.raises(InputError) as caught:
         reported(folder.save(tmp_path, TABLES, sweeps=False), results)

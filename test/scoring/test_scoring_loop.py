@@ -98,7 +98,7 @@ def test_a_command_whose_run_ends_says_so_in_one_line(root, tmp_path, monkeypatc
     for jobs in 1, 2:
         assert exit_of(monkeypatch, "evaluate", "detection", "--data", root, "--results",
                        tmp_path / "found", "--jobs", jobs) == 2
-        assert "no result file" in error_line(capsys)
+        assert "result file" in error_line(capsys)
     with pytest.raises(RunError):
         [*results(open_recording(root), partial(by_files, tmp_path / "found"))]
 

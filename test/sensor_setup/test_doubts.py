@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tilted_samples import clouds_of
 
-from lidar_perception.data.raw_clouds import _of_frame
+from lidar_perception.data.raw_clouds import _to_message
 from lidar_perception.robot.crop import select_points
 from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placement import make_tilted_pose
@@ -244,7 +244,7 @@ def test_which_way_is_ahead_is_told_however_slowly_the_robot_drives(name):
     for degrees in (0, 90, 180, -25):
         a = np.radians(degrees)
         turn = turned([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
-        m = of([scan_of(changed(_of_frame(frame), turn)) for frame in frames], range(count))
+        m = of([scan_of(changed(_to_message(frame), turn)) for frame in frames], range(count))
         row = next(finding for finding in findings(m) if finding.what == "ahead")
         if not speed:
             assert said(m, "yaw not known: the robot moved only 0.0 m", "record")

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from robot_bags import ON_BASE, START, base_at, mount, moving, moving_tf, recorded, tf, transform
 
-from lidar_perception.data.raw_clouds import _of_frame, open_clouds
+from lidar_perception.data.raw_clouds import _to_message, open_clouds
 from lidar_perception.params import ReceptionParams
 from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.robot.poses import invert_pose
@@ -33,7 +33,7 @@ COUNT, HEIGHT = 8, 1.7
 def drive():
     """Scans and poses of a sensor that drives ahead at a car's speed."""
     frames = list(simulated_scans(502, COUNT, sensor_named("vlp-16"), 40, Scenes(scene="street")))
-    return [scan_of(_of_frame(frame)) for frame in frames], [frame.pose() for frame in frames]
+    return [scan_of(_to_message(frame)) for frame in frames], [frame.pose() for frame in frames]
 
 
 def on_robot(yaw, roll=0.0, pitch=0.0):

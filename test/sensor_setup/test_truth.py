@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tilted_samples import BARE, MOUNTS, clouds_of
 
-from lidar_perception.data.raw_clouds import open_clouds, spread
+from lidar_perception.data.raw_clouds import choose_clouds, open_clouds
 from lidar_perception.sensor_setup.beams import Beams, beams_of
 from lidar_perception.sensor_setup.doubts import doubts
 from lidar_perception.sensor_setup.files import chosen_params, params_yaml, sensor_yaml
@@ -167,7 +167,7 @@ def test_intensities_that_never_change_are_read_as_0_as_sensor_yaml_has_them():
     ("sensors/pandar64.pcd", "pandar64", None, 64)])
 def test_real_sensors_are_known_by_their_beams(data, folder, model, height, rings):
     clouds = open_clouds(data / folder)
-    numbers = spread(clouds.count, 4)
+    numbers = choose_clouds(clouds.count, 4)
     m = measured([scan_of(clouds.load(i)) for i in numbers], numbers, folder, clouds.count, None)
     assert m.model == model and rings - 2 <= len(m.beams.elevations) <= rings
     assert m.step == pytest.approx(np.degrees(sensor_named(model).azimuth_step), rel=0.05)

@@ -12,7 +12,7 @@ from test_street import flat_boxes, overlaps
 from lidar_perception.cli.simulate import simulate
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.semantickitti import MOVING
-from lidar_perception.data.to_bag import points_of
+from lidar_perception.data.to_bag import to_point_array
 from lidar_perception.sensor_setup.mount import mount_of
 from lidar_perception.sensor_setup.scans import scan_of
 from lidar_perception.simulation.camera import worth_a_label
@@ -150,7 +150,7 @@ def test_a_mix_takes_turns_and_is_trained_on():
 def test_setup_finds_the_height_indoors(kind):
     sensor = replace(sensor_named("vlp-16", 0.6), azimuth_step=float(np.radians(0.8)))
     frames = [scan_at(7, i, sensor, Scenes(kind, 1.0, "indoor")).frame for i in (0, 1, 90, 91)]
-    mount = mount_of([scan_of(from_array(points_of(frame), header(bag_message, frame.stamp_ns),
+    mount = mount_of([scan_of(from_array(to_point_array(frame), header(bag_message, frame.stamp_ns),
                                          bag_message)) for frame in frames])
     assert mount.height == pytest.approx(0.6, abs=0.02)
     assert np.degrees([mount.roll, mount.pitch]) == pytest.approx([0.0, 0.0], abs=0.2)

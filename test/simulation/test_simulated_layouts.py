@@ -72,7 +72,8 @@ def test_object_layout_reads_back(made):
 
 def test_what_is_hidden_or_nearly_so_is_not_labelled_but_marked():
     scan = scan_at(33, 0, SENSORS["hdl64e"], CROWDED)
-    seen, labels = write_kitti.seen_by_camera(scan.truth, FORWARD_CAMERA), kitti_labels(scan.truth)
+    seen = write_kitti.keep_visible_objects(scan.truth, FORWARD_CAMERA)
+    labels = kitti_labels(scan.truth)
     assert 0 < len(labels) < len(seen) == len(labels) + len(labels.notes)
     assert all(e["num_points"] >= 5 and e["visible"] >= 0.15 for e in labels.extras)
     kept = {e["track_id"] for e in labels.extras}
@@ -144,7 +145,7 @@ def test_a_low_sensor_is_low_in_every_layout(tmp_path, layout, inner):
     assert run(low, layout, 2, 1, "--mount-height", 0.6).exit_code == 0
     for path in (low, low / inner):
         recording = open_recording(path)
-        assert recording.mounted and {frame.sensor_height for frame in recording} == {0.6}
+        assert recording.has_sensor_height and {frame.sensor_height for frame in recording} == {0.6}
     assert open_recording(low, sensor_height=1.0).frames[0].sensor_height == 1.0
     for other in ("{", "[" * 10**4, '{"height": 480}',  # of another program
                   '{"height": "1", "sensor_digest": ""}', '{"height": NaN, "sensor_digest": ""}'):
@@ -168,13 +169,13 @@ def test_2d_boxes_are_those_of_the_corners_in_the_image():
     boxes = np.column_stack([rng.uniform(-10, 60, 300), rng.uniform(-20, 20, 300),
                              rng.uniform(-2, 1, 300), rng.uniform(0.3, 6, (300, 3)),
                              rng.uniform(-4, 4, 300)])
-    found, outside = write_kitti.image_boxes(boxes, FORWARD_CAMERA)
+    found, outside = write_kitti.project_boxes(boxes, FORWARD_CAMERA)
     seen = np.isfinite(found[:, 0])
     assert 30 < seen.sum() < 250 and ((outside >= 0) & (outside <= 1)).all()
     assert (found[seen] >= 0).all() and (found[seen] <= [1241, 374, 1241, 374]).all()
     projection = FORWARD_CAMERA.camera().projection
     corners = box_corners(boxes) @ projection[:, :3].T + projection[:, 3]
-    whole = (corners[..., 2] > write_kitti.NEAR).all(axis=1)
+    whole = (corners[..., 2] > write_kitti.MIN_DEPTH_M).all(axis=1)
     pixels = corners[..., :2] / corners[..., 2:]
     inside = whole & ((pixels >= 0) & (pixels <= [1241, 374])).all(axis=(1, 2)) & seen
     assert inside.sum() > 10 and np.abs(outside[inside]).max() < 1e-9
@@ -186,7 +187,7 @@ def test_2d_boxes_are_those_of_the_corners_in_the_image():
         cos, sin = np.cos(box[6]), np.sin(box[6])
         points = inner @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]) + box[:3]
         p = points @ projection[:, :3].T + projection[:, 3]
-        p = p[p[:, 2] > write_kitti.NEAR]
+        p = p[p[:, 2] > write_kitti.MIN_DEPTH_M]
         uv = np.clip(p[:, :2] / p[:, 2:], 0, [1241, 374])
         assert (uv >= limits[:2] - 1e-6).all() and (uv <= limits[2:] + 1e-6).all()
 
@@ -195,7 +196,7 @@ def test_2d_boxes_are_those_of_real_labels(data):
     worst, shares = [], []
     for frame in open_recording(data / "kitti_object"):
         truth = frame.truth()
-        boxes, outside = write_kitti.image_boxes(truth.boxes, frame.calibration())
+        boxes, outside = write_kitti.project_boxes(truth.boxes, frame.calibration())
         for box, share, extra in zip(boxes, outside, truth.extras):
             worst.append(np.abs(box - extra["bbox"]).max())
             shares.append(abs(share - extra["truncated"]))
@@ -207,7 +208,7 @@ def test_labels_without_objects_read_back(tmp_path):
     nothing = type(nothing).of([], [])
     write_kitti.write_object(tmp_path, 0, np.zeros((0, 4)), nothing, FORWARD_CAMERA)
     assert len(read_object_labels(tmp_path / "training/label_2/000000.txt", np.eye(4))) == 0
-    text = write_kitti.tracking_label_text(0, nothing, FORWARD_CAMERA)
+    text = write_kitti.format_tracking_labels(0, nothing, FORWARD_CAMERA)
     (tmp_path / "0000.txt").write_text(text)
     assert read_tracking_labels(tmp_path / "0000.txt", np.eye(4)) == {}
 

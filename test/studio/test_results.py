@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from lidar_perception.classes import CAR, CLASSES, DETECTED, PEDESTRIAN
 from lidar_perception.cli.main import cli
-from lidar_perception.data.bag import BagWriter, KeptOpen
+from lidar_perception.data.bag import BagHandle, BagWriter
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.open import open_recording
 from lidar_perception.types import Detections, GroundTruth, InputError
@@ -149,7 +149,7 @@ def test_tracks_of_all_trackers_in_a_bag_keep_apart(tmp_path):
             made.write(topic, 10, to_marker_array(
                 np.tile([5.0, 0, 0, 1, 1, 1, 0], (2, 1)), ["Car"] * 2, ids=ids,
                 header=header_message(10, "velodyne", bag_message), make=bag_message))
-    found = recorded(BagPoses(KeptOpen(tmp_path / "bag"), ""), [10]).tracks
+    found = recorded(BagPoses(BagHandle(tmp_path / "bag"), ""), [10]).tracks
     assert len({t["id"] for t in found}) == len(found) == 4
     assert {t["source"] for t in found} == {"a", "b"}
 

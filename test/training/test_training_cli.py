@@ -153,7 +153,7 @@ def test_training_and_validation_share_no_frame_by_any_path(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("arguments, reason", [
-    (["--data", "nowhere"], "there is no nowhere; give a bag or the folder of a data set"),
+    (["--data", "nowhere"], "nowhere does not exist; give a bag or the folder of a data set"),
     (["--data", "sim", "--sensor", "lidar9000"], "lidar9000"),
     (["--data", "sim", "--device", "tpu"], "tpu"),
     (["--data", "sim", "--lr", "0"], "lr = 0"),

@@ -103,7 +103,7 @@ def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None,
     if CAMERA not in recording.has and (results is not None or write_results is not None):
         terminal_errors.print(f"{recording.path} has no camera calibration: result files are in "
                               "the frame of a nominal camera, as detect writes them", style="dim")
-    report = DetectionReport(follow=recording.drives)
+    report = DetectionReport(follow=recording.is_sequential)
     walk.fill(report, recording, start)
     if write_results is not None:
         console.print(f"result files: {write_results}")

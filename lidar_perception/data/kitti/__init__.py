@@ -1,1 +1,1 @@
-"""KITTI: the object, tracking and raw layouts, read and written."""
+"""KITTI's object, tracking, odometry and raw layouts, and KITTI-360."""

@@ -1,4 +1,4 @@
-"""KITTI-360 folders: raw scans of the Velodyne, with poses and the calibration of the left camera.
+"""KITTI-360: raw scans of the Velodyne, with poses and the calibration of the left camera.
 
 Liao et al., TPAMI 2022; the scripts at github.com/autonomousvision/kitti360Scripts define the
 matrices.
@@ -14,102 +14,113 @@ from pathlib import Path
 import numpy as np
 
 from lidar_perception.camera import Calibration
-from lidar_perception.data.frame import CAMERA, POSES, Recording, nothing
+from lidar_perception.data.frame import CAMERA, POSES, Recording, return_none
 from lidar_perception.data.kitti import raw
-from lidar_perception.data.kitti.calibration import homogeneous, matrices, matrix, rigid
+from lidar_perception.data.kitti.calibration import (
+    check_pose,
+    get_matrix,
+    read_matrices,
+    to_homogeneous,
+)
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
 SCANS, CALIBRATION, POSE_FILES = "data_3d_raw", "calibration", ("cam0_to_world.txt", "poses.txt")
 
 
-def recognises(path: Path) -> bool:
+def is_layout(path: Path) -> bool:
     """Return True for the folder with data_3d_raw/, for data_3d_raw/, and for a drive in it."""
-    return _root(path) is not None
+    return _find_root(path) is not None
 
 
-def _root(path: Path) -> Path | None:
+def _find_root(path: Path) -> Path | None:
     path = path.absolute()
     return next((folder for folder in (path, *path.parents[:2]) if (folder / SCANS).is_dir()
                  and (folder == path or path.relative_to(folder).parts[0] == SCANS)), None)
 
 
-def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """Open the scans of the drives, in order of time, with poses from data_poses/ and the camera of
-    calibration/ where they are; only the file lists and the time stamps are read."""
-    root = _root(path)
+def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
+    """Open the scans of all drives in order of time; only the file lists and time stamps are read.
+
+    Poses come from data_poses/ and the camera from calibration/, if they exist.
+    """
+    root = _find_root(path)
     assert root is not None
-    here = path.absolute()
+    opened = path.absolute()
     drives = sorted(data.parents[1] for data in (root / SCANS).glob(f"*/{raw.DATA}")
-                    if here in (*data.parents, root / SCANS))
-    frames, timed = raw.frames_of(drives)
+                    if opened in (*data.parents, root / SCANS))
+    frames, has_times = raw.make_frames(drives)
     if not frames:
         raise InputError(f"{path} has no KITTI-360 scans: expected {SCANS}/DRIVE/{raw.DATA}/*.bin")
-    calibrated = (root / CALIBRATION).is_dir()
-    poses = {drive.name: cache(partial(_poses, root, drive.name)) for drive in drives}
-    posed = calibrated and any(_pose_file(root, name) for name in poses)
-    calibration = cache(partial(_calibration, root)) if calibrated else nothing
+    has_calibration = (root / CALIBRATION).is_dir()
+    poses = {drive.name: cache(partial(_read_poses, root, drive.name)) for drive in drives}
+    has_poses = has_calibration and any(_find_pose_file(root, name) for name in poses)
+    calibration = cache(partial(_read_calibration, root)) if has_calibration else return_none
     image = "data_2d_raw/{}/image_00/data_rect/{}.png"
     return Recording(path, "KITTI-360", [replace(
         frame, calibration=calibration,
-        pose=partial(_pose, poses[frame.sequence], frame.index) if posed else nothing,
+        pose=partial(_get_pose, poses[frame.sequence], frame.index) if has_poses else return_none,
         image=root / image.format(frame.sequence, frame.name.rpartition("/")[2]), files=())
-        for frame in frames], frozenset([CAMERA] * calibrated + [POSES] * posed), timed=timed)
+        for frame in frames], frozenset([CAMERA] * has_calibration + [POSES] * has_poses),
+        has_times=has_times)
 
 
-def _calibration(root: Path) -> Calibration:
-    """The calibration of the rectified left camera."""
+def _read_calibration(root: Path) -> Calibration:
+    """Return the calibration of the rectified left camera."""
     path = root / CALIBRATION / "perspective.txt"
-    values = matrices(path)
-    width, height = matrix(values, path, "S_rect_00", (2,)).astype(int).tolist()
-    return Calibration(matrix(values, path, "P_rect_00", (3, 4)),
-                       _rectify(root) @ np.linalg.inv(_camera_to_lidar(root)), width, height)
+    values = read_matrices(path)
+    width, height = get_matrix(values, path, "S_rect_00", (2,)).astype(int).tolist()
+    lidar_to_camera = _read_rectification(root) @ np.linalg.inv(_read_camera_to_lidar(root))
+    return Calibration(get_matrix(values, path, "P_rect_00", (3, 4)), lidar_to_camera, width,
+                       height)
 
 
-def _rectify(root: Path) -> np.ndarray:
-    """(4, 4) from the left camera to the rectified one."""
+def _read_rectification(root: Path) -> np.ndarray:
+    """Return the transform (4, 4) from the left camera to the rectified one."""
     path = root / CALIBRATION / "perspective.txt"
-    return rigid(homogeneous(matrix(matrices(path), path, "R_rect_00", (3, 3))), path)
+    rotation = get_matrix(read_matrices(path), path, "R_rect_00", (3, 3))
+    return check_pose(to_homogeneous(rotation), path)
 
 
-def _camera_to_lidar(root: Path) -> np.ndarray:
-    """(4, 4) from the left camera to the LiDAR."""
+def _read_camera_to_lidar(root: Path) -> np.ndarray:
+    """Return the transform (4, 4) from the left camera to the LiDAR."""
     path = root / CALIBRATION / "calib_cam_to_velo.txt"
-    return rigid(homogeneous(_rows(path, 12)[0].reshape(3, 4)), path)
+    return check_pose(to_homogeneous(_read_rows(path, 12)[0].reshape(3, 4)), path)
 
 
-def _pose_file(root: Path, drive: str) -> Path | None:
+def _find_pose_file(root: Path, drive: str) -> Path | None:
     files = [root / "data_poses" / drive / name for name in POSE_FILES]
     return next((file for file in files if file.is_file()), None)
 
 
-def _poses(root: Path, drive: str) -> dict[int, np.ndarray]:
-    """Number of a frame -> (4, 4) the LiDAR in the world, of those that have a pose."""
-    path = _pose_file(root, drive)
+def _read_poses(root: Path, drive: str) -> dict[int, np.ndarray]:
+    """Return the poses (4, 4) of the LiDAR in the world, by frame number."""
+    path = _find_pose_file(root, drive)
     if path is None:
         return {}
-    to_camera = np.linalg.inv(_camera_to_lidar(root))
+    to_camera = np.linalg.inv(_read_camera_to_lidar(root))
     if path.name == POSE_FILES[0]:  # of the rectified camera
-        return {int(row[0]): rigid(row[1:].reshape(4, 4), path) @ _rectify(root) @ to_camera
-                for row in _rows(path, 17)}
+        rectify = _read_rectification(root)
+        return {int(row[0]): check_pose(row[1:].reshape(4, 4), path) @ rectify @ to_camera
+                for row in _read_rows(path, 17)}
     mount = root / CALIBRATION / "calib_cam_to_pose.txt"
-    to_vehicle = rigid(homogeneous(matrix(matrices(mount), mount, "image_00", (3, 4))), mount)
-    return {int(row[0]): rigid(homogeneous(row[1:].reshape(3, 4)), path) @ to_vehicle @ to_camera
-            for row in _rows(path, 13)}
+    camera_mount = get_matrix(read_matrices(mount), mount, "image_00", (3, 4))
+    to_vehicle = check_pose(to_homogeneous(camera_mount), mount)
+    return {int(row[0]): check_pose(to_homogeneous(row[1:].reshape(3, 4)), path)
+            @ to_vehicle @ to_camera for row in _read_rows(path, 13)}
 
 
-def _pose(poses: Callable[[], dict[int, np.ndarray]], number: int) -> np.ndarray | None:
+def _get_pose(poses: Callable[[], dict[int, np.ndarray]], number: int) -> np.ndarray | None:
     return poses().get(number)
 
 
-def _rows(path: Path, columns: int) -> np.ndarray:
-    """(N, columns) numbers of a file. InputError for another one."""
+def _read_rows(path: Path, columns: int) -> np.ndarray:
+    """Read rows of numbers, (N, columns). Raises InputError if the file has other contents."""
     rows = [line.split() for line in read_text(path, what="the matrices").splitlines()]
     try:
         found = np.array([row for row in rows if row], float).reshape(-1, columns)
     except ValueError:
         found = np.full((0, columns), np.nan)
     if not (len(found) and np.isfinite(found).all()):
-        raise InputError(f"{path} has a line that is not {columns} finite numbers; download it "
-                         "again")
+        raise InputError(f"{path} has a line without {columns} finite numbers; download it again")
     return found

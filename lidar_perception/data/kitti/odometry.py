@@ -1,4 +1,4 @@
-"""KITTI odometry folders: sequences of scans with times, a calibration and poses."""
+"""KITTI odometry: sequences of scans with times, calibration and poses."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.data.frame import CAMERA, POSES, Frame, Recording, nothing
+from lidar_perception.data.frame import CAMERA, POSES, Frame, Recording, return_none
 from lidar_perception.data.kitti.calibration import (
-    homogeneous,
-    matrices,
-    matrix,
+    check_pose,
+    get_matrix,
+    read_matrices,
     read_odometry_calibration,
-    rigid,
+    to_homogeneous,
 )
 from lidar_perception.data.kitti.folder import (
     GAP_NS,
     PERIOD_NS,
     START_NS,
     load_velodyne,
-    number_of,
-    velodyne_scale,
+    make_velodyne_scale_reader,
+    parse_scan_number,
 )
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
 CALIBRATION, TIMES, POSES_FILE = FILES = ("calib.txt", "times.txt", "poses.txt")
-SINCE_1970 = 10**9  # seconds: later times are not counted from the start of the sequence
+SINCE_1970 = 10**9  # seconds; larger times count from 1970, others from the start of the sequence
 
 
-def recognises(path: Path) -> bool:
-    """Return True for a folder with sequences/ or dataset/sequences/, for sequences/, and for one
+def is_layout(path: Path) -> bool:
+    """Return True for a folder with sequences/ or dataset/sequences/, for sequences/, and for a
     sequence."""
     return any((path / folder).is_dir() for folder in ("sequences", "dataset/sequences")) or any(
         map(_is_sequence, (path, *path.glob("*/"))))
@@ -44,8 +44,8 @@ def _is_sequence(path: Path) -> bool:
         (path / "labels").is_dir() or any((path / name).is_file() for name in FILES))
 
 
-def sequences_of(path: Path) -> list[Path]:
-    """List the folders of the sequences at a path that recognises() accepts, in order."""
+def list_sequences(path: Path) -> list[Path]:
+    """Return the sequence folders at a path that is_layout accepts, sorted by name."""
     path = path.absolute()
     for folder in (path / "dataset/sequences", path / "sequences"):
         if folder.is_dir():
@@ -53,93 +53,105 @@ def sequences_of(path: Path) -> list[Path]:
     return [path] if _is_sequence(path) else sorted(filter(_is_sequence, path.glob("*/")))
 
 
-def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """Open the scans of sequences/NN/velodyne, with the poses of sequences/NN/poses.txt or
-    poses/NN.txt; only the file lists and the times are read."""
-    sequences = [s for s in sequences_of(path) if any(s.glob("velodyne/*.bin"))]
+def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
+    """Open the scans of sequences/NN/velodyne; only the file lists and the times are read.
+
+    Poses come from sequences/NN/poses.txt or poses/NN.txt.
+    """
+    sequences = [s for s in list_sequences(path) if any(s.glob("velodyne/*.bin"))]
     if not sequences:
-        raise InputError(f"{path} has no KITTI odometry scans and no SemanticKITTI scans: expected "
+        raise InputError(f"{path} has no scans of KITTI odometry or SemanticKITTI: expected "
                          "sequences/00/velodyne/*.bin")
     if not any(map(_is_sequence, sequences)):
         raise InputError(f"{path} has scans but no labels: expected sequences/00/labels/*.label of "
                          "SemanticKITTI, or calib.txt and times.txt of KITTI odometry; download "
                          "them too")
-    frames, timed = frames_of(sequences)
-    has = {POSES} if any(pose_file(s) for s in sequences) else set()
+    frames, has_times = make_frames(sequences)
+    has = {POSES} if any(find_pose_file(s) for s in sequences) else set()
     if any((s / CALIBRATION).is_file() for s in sequences):
         has.add(CAMERA)
-    return Recording(path, "KITTI odometry", frames, frozenset(has), timed=timed)
+    return Recording(path, "KITTI odometry", frames, frozenset(has), has_times=has_times)
 
 
-def frames_of(sequences: list[Path]) -> tuple[list[Frame], bool]:
-    """Return the frames of sequences with scans, GAP_NS between two, and whether all their times
-    are recorded; otherwise 10 Hz is assumed."""
+def make_frames(sequences: list[Path]) -> tuple[list[Frame], bool]:
+    """Make the frames of sequences with scans, GAP_NS between two sequences.
+
+    Returns:
+        The frames, and True if the times of all of them are recorded; otherwise 10 Hz is assumed.
+    """
     frames: list[Frame] = []
-    timed = True
+    has_times = True
     scans = {sequence: sorted(sequence.glob("velodyne/*.bin")) for sequence in sequences}
-    scale = velodyne_scale([file for files in scans.values() for file in files])
+    scale = make_velodyne_scale_reader([file for files in scans.values() for file in files])
     for sequence, files in scans.items():
         start = frames[-1].stamp_ns + GAP_NS if frames else START_NS
-        times = _times(sequence / TIMES)
-        timed = timed and bool(times)
-        poses, calib = cache(partial(_poses, sequence)), sequence / CALIBRATION
+        times = _read_times(sequence / TIMES)
+        has_times = has_times and bool(times)
+        poses, calib = cache(partial(_read_poses, sequence)), sequence / CALIBRATION
         image = sequence / "image_2"
         calibration = cache(partial(
             read_odometry_calibration, calib, image / f"{files[0].stem}.png")
-        ) if calib.is_file() else nothing
+        ) if calib.is_file() else return_none
         if times and times[0] > SINCE_1970 * 10**9:
             start = 0
         for scan in files:
-            number = number_of(scan)
+            number = parse_scan_number(scan)
             if times and number >= len(times):
-                raise InputError(f"{sequence / TIMES} has {len(times)} lines, and none for scan "
-                                 f"{number}; download it again")
+                raise InputError(f"{sequence / TIMES} has only {len(times)} lines, but there is a "
+                                 f"scan {number}; download it again")
             stamp = start + (times[number] if times else
-                             (number - number_of(files[0])) * PERIOD_NS)
+                             (number - parse_scan_number(files[0])) * PERIOD_NS)
             frames.append(Frame(
                 f"{sequence.name}/{scan.stem}", stamp, partial(load_velodyne, scan, stamp, scale),
-                calibration=calibration, pose=partial(_pose, poses, number),
+                calibration=calibration, pose=partial(_parse_pose, poses, number),
                 sequence=sequence.name, index=number, points=scan,
                 image=image / f"{scan.stem}.png", intensity_max=scale))
-    return frames, timed
+    return frames, has_times
 
 
-def _times(path: Path) -> list[int]:
-    """Nanoseconds of the lines of times.txt, which are seconds; empty without this file."""
+def _read_times(path: Path) -> list[int]:
+    """Return the times in times.txt (seconds) in ns; empty if the file does not exist."""
     if not path.is_file():
         return []
     try:
         return [int(Decimal(word) * 10**9) for word in read_text(path, what="the times").split()]
     except (InvalidOperation, ValueError, OverflowError):
-        raise InputError(f"{path} has a line that is no number of seconds; download it again"
+        raise InputError(f"{path} has a line that is not a number of seconds; download it again"
                          ) from None
 
 
-def pose_file(sequence: Path) -> Path | None:
-    """Return the file with the poses of a sequence; None where there is none."""
+def find_pose_file(sequence: Path) -> Path | None:
+    """Return the file with the poses of a sequence, or None."""
     files = (sequence / POSES_FILE, sequence.parents[1] / f"poses/{sequence.name}.txt")
     return next((file for file in files if file.is_file()), None)
 
 
-def _poses(sequence: Path) -> tuple[np.ndarray, Path, list[str]] | None:
-    """(4, 4) the LiDAR's frame in the camera's, and the file of poses with its lines; None without
-    it. InputError for files that are not as they should be."""
-    if (poses := pose_file(sequence)) is None:
+def _read_poses(sequence: Path) -> tuple[np.ndarray, Path, list[str]] | None:
+    """Read the poses of a sequence.
+
+    Returns:
+        Pose (4, 4) of the LiDAR in the camera frame, the file of poses, and its lines. None without
+        a file of poses.
+    """
+    if (poses := find_pose_file(sequence)) is None:
         return None
     calibration = sequence / CALIBRATION
-    to_camera = homogeneous(matrix(matrices(calibration), calibration, "Tr", (3, 4)))
-    return rigid(to_camera, calibration), poses, read_text(poses, what="the poses").splitlines()
+    to_camera = to_homogeneous(get_matrix(read_matrices(calibration), calibration, "Tr", (3, 4)))
+    lines = read_text(poses, what="the poses").splitlines()
+    return check_pose(to_camera, calibration), poses, lines
 
 
-def _pose(poses: Callable[[], tuple[np.ndarray, Path, list[str]] | None],
-          i: int) -> np.ndarray | None:
-    """(4, 4) the LiDAR's frame of scan number i in that of scan 0, of the line that has the pose of
-    the camera; None without poses. InputError also for a line that is none, or not there."""
-    if (read := poses()) is None:
+def _parse_pose(poses: Callable[[], tuple[np.ndarray, Path, list[str]] | None],
+                i: int) -> np.ndarray | None:
+    """Return the pose (4, 4) of scan i in the frame of scan 0; None without poses.
+
+    Line i of the file has the pose of the camera. Raises InputError if it is missing or invalid.
+    """
+    if (content := poses()) is None:
         return None
-    to_camera, path, lines = read
+    to_camera, path, lines = content
     try:
-        moved = np.array(lines[i].split(), float).reshape(3, 4)
+        camera_pose = np.array(lines[i].split(), float).reshape(3, 4)
     except (ValueError, IndexError) as error:
         raise InputError(f"cannot read pose {i} of {path} ({error}); download it again") from None
-    return np.linalg.inv(to_camera) @ rigid(homogeneous(moved), path) @ to_camera
+    return np.linalg.inv(to_camera) @ check_pose(to_homogeneous(camera_pose), path) @ to_camera

@@ -1,5 +1,8 @@
-"""Result files of KITTI's object benchmark, one a frame, a label line with a score a detection; and
-of its tracking benchmark, one a sequence, with the frame's number and the track's id before it."""
+"""Result files of KITTI's object and tracking benchmarks.
+
+The object benchmark has one file per frame, with one label line and a score per detection. The
+tracking benchmark has one file per sequence, with frame number and track id before the label.
+"""
 
 from __future__ import annotations
 
@@ -12,30 +15,31 @@ from lidar_perception.camera import FORWARD_CAMERA, Calibration
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.labels import (
     format_label,
-    parsed_lines,
+    parse_lines,
     read_tracking_labels,
     to_ground_truth,
     to_labels,
 )
-from lidar_perception.data.kitti.write import image_boxes, tracking_line
+from lidar_perception.data.kitti.write import format_tracking_line, project_boxes
 from lidar_perception.runs import journal
 from lidar_perception.runs.files import write_text
 from lidar_perception.types import Detections, GroundTruth, InputError
 
-FOLDER = "kitti"  # of result files in the folder of a run
-DECIMALS = 6  # of a score, so that the order of weak ones stays, and of metres, so that overlaps do
+FOLDER = "kitti"  # folder of result files in the folder of a run
+DECIMALS = 6  # with fewer, the order of weak scores and overlaps would change
 
 
-def result_files(folder: Path) -> Path:
-    """Return the folder of result files: `folder`, or its kitti/ where it is that of a run of
-    `detect`."""
+def find_result_folder(folder: Path) -> Path:
+    """Return the folder of result files: `folder`, or its kitti/ if it is a run of `detect`."""
     return folder / FOLDER if (folder / journal.NAME).is_file() and (
         folder / FOLDER).is_dir() else folder
 
 
-def result_calibration(frame: Frame) -> tuple[Calibration, bool]:
-    """Return the calibration in whose camera's frame the result file of a frame is, and True where
-    that is a nominal camera, as the frame has none or its own cannot be read."""
+def choose_calibration(frame: Frame) -> tuple[Calibration, bool]:
+    """Return the calibration for the result file of a frame, and True if it is a nominal one.
+
+    The nominal camera is used if the frame has no calibration, or an unreadable one.
+    """
     try:
         own = frame.calibration()
     except InputError:
@@ -44,42 +48,55 @@ def result_calibration(frame: Frame) -> tuple[Calibration, bool]:
 
 
 def read_results(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
-    """Detections of one file, score in extras; lidar_to_camera (4, 4). InputError names the file,
-    and the line that is no result."""
+    """Read the detections of a result file; scores are in extras.
+
+    Args:
+        lidar_to_camera: transform (4, 4).
+
+    Raises:
+        InputError: the file is missing, or a line is not a result.
+    """
     if not path.exists():
-        raise InputError(f"there is no result file {path}; a frame without detections needs an "
-                         "empty one, and --split says which frames to score")
+        raise InputError(f"the result file {path} does not exist; a frame without detections needs "
+                         "an empty file, and --split selects the frames to score")
     labels = []
-    for number, label in parsed_lines(path, known_only=True):
+    for number, label in parse_lines(path, known_only=True):
         if "score" not in label:
-            raise InputError(f"{path}:{number} is no result: a class and 14 numbers, and no score "
-                             "as the 15th")
+            raise InputError(f"{path}:{number} is not a result: the score, the 15th number after "
+                             "the class, is missing")
         labels.append(label)
     return to_ground_truth(labels, lidar_to_camera)
 
 
 def write_results(path: Path, detections: Detections, calibration: Calibration) -> None:
-    """Write the result file of one frame: truncation and occlusion -1, the 2D box projected (0
-    outside the image). InputError where it cannot be written."""
+    """Write the result file of one frame. Raises InputError if it cannot be written.
+
+    Truncation and occlusion are -1. The 2D box is projected, 0 outside the image.
+    """
     write_text(path, "".join(format_label(label, DECIMALS) + "\n"
-                             for label in _labels(detections, calibration)))
+                             for label in _to_result_labels(detections, calibration)))
 
 
 def write_tracking_results(path: Path, frames: Iterable[tuple[int, np.ndarray, Detections]],
                            calibration: Calibration) -> None:
-    """Write the result file of one sequence of the tracking benchmark: of each frame its number,
-    track ids (K,) int and the boxes. Other columns as in write_results. InputError where it cannot
-    be written."""
+    """Write the result file of one sequence of the tracking benchmark.
+
+    Args:
+        frames: frame number, track ids (K,) int and detections of each frame.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     lines = []
     for number, ids, detections in frames:
-        lines += [tracking_line(number, int(track), label)
-                  for track, label in zip(ids, _labels(detections, calibration))]
+        lines += [format_tracking_line(number, int(track), label)
+                  for track, label in zip(ids, _to_result_labels(detections, calibration))]
     write_text(path, "".join(lines))
 
 
-def _labels(detections: Detections, calibration: Calibration) -> list[dict]:
-    """The detections as labels of a result file, see write_results."""
-    pixels = np.nan_to_num(image_boxes(detections.boxes, calibration)[0])
+def _to_result_labels(detections: Detections, calibration: Calibration) -> list[dict]:
+    """Convert detections to labels of a result file, see write_results."""
+    pixels = np.nan_to_num(project_boxes(detections.boxes, calibration)[0])
     extras = [{"score": float(score), "bbox": box.tolist(), "truncated": "-1", "occluded": -1}
               for score, box in zip(detections.scores, pixels)]
     return to_labels(GroundTruth.of(detections.boxes, detections.class_ids, extras),
@@ -87,9 +104,15 @@ def _labels(detections: Detections, calibration: Calibration) -> list[dict]:
 
 
 def read_tracking_results(path: Path, lidar_to_camera: np.ndarray) -> dict[int, GroundTruth]:
-    """Frame number -> tracks, track_id and score in extras, of a result file of the tracking
-    benchmark; frames without tracks are left out. InputError as of read_tracking_labels, and for a
-    line without a score."""
+    """Read a result file of the tracking benchmark.
+
+    Returns:
+        Tracks by frame number, with track_id and score in extras; frames without tracks are left
+        out.
+
+    Raises:
+        InputError: a line is malformed or has no score.
+    """
     frames = read_tracking_labels(path, lidar_to_camera, known_only=True)
     for number, tracks in frames.items():
         if not all("score" in extra for extra in tracks.extras):

@@ -1,4 +1,4 @@
-"""Boxes as nuScenes has them: in the global frame, with a velocity and an attribute.
+"""Boxes in nuScenes' global frame, with velocity and attribute.
 
 Caesar et al., CVPR 2020. The global frame is that of a city's map: x east, y north, z up, metres.
 """
@@ -16,7 +16,7 @@ from lidar_perception.types import LARGEST
 # The ten classes of the detection task.
 NAMES = ("car", "truck", "bus", "trailer", "construction_vehicle", "pedestrian", "motorcycle",
          "bicycle", "traffic_cone", "barrier")
-# The labels' categories that belong to them; the others, such as animals, are of no class.
+# Class of the categories of labels; other categories, such as animals, have none.
 CATEGORIES = {
     "vehicle.car": "car", "vehicle.truck": "truck", "vehicle.bus.bendy": "bus",
     "vehicle.bus.rigid": "bus", "vehicle.trailer": "trailer",
@@ -33,12 +33,18 @@ WITH_RIDER = ATTRIBUTES.index("cycle.with_rider")
 
 @dataclass(frozen=True)
 class GlobalBoxes:
-    """K boxes in the global frame, float64 unless said otherwise.
+    """K boxes in the global frame; float64 unless stated otherwise.
 
-    centres (K, 3) metres; sizes (K, 3) [l w h]; rotations (K, 4) quaternions [w x y z];
-    class_ids (K,) int into NAMES, -1 = none of them; attributes (K,) int into ATTRIBUTES, -1 =
-    none; velocities (K, 2) m/s, NaN = not known; scores (K,), 0 for labels; points (K,) int
-    returns of LiDAR and radar inside, -1 = not counted, as in detections.
+    Attributes:
+        centres: (K, 3) metres.
+        sizes: (K, 3) [l w h] metres.
+        rotations: (K, 4) quaternions [w x y z].
+        class_ids: (K,) int into NAMES, -1 = none of them.
+        attributes: (K,) int into ATTRIBUTES, -1 = none.
+        velocities: (K, 2) m/s, NaN = unknown.
+        scores: (K,), 0 for labels.
+        points: (K,) int, number of LiDAR and radar returns inside, -1 = not counted, as in
+            detections.
     """
 
     centres: np.ndarray
@@ -53,7 +59,7 @@ class GlobalBoxes:
     @staticmethod
     def of(centres, sizes, rotations, class_ids, attributes=-1, velocities=np.nan, scores=0.0,
            points=-1) -> GlobalBoxes:
-        """Boxes with dtypes and shapes put right; the columns with a default may be scalars."""
+        """Make boxes with the right dtypes and shapes; columns with a default may be scalars."""
         centres = np.asarray(centres, np.float64).reshape(-1, 3)
         count = len(centres)
 
@@ -71,8 +77,7 @@ class GlobalBoxes:
         return GlobalBoxes.of((), (), (), ())
 
     @staticmethod
-    def together(parts: list[GlobalBoxes]) -> GlobalBoxes:
-        """All boxes behind one another."""
+    def concatenate(parts: list[GlobalBoxes]) -> GlobalBoxes:
         parts = parts or [GlobalBoxes.none()]
         return GlobalBoxes(*(np.concatenate([getattr(part, field.name) for part in parts])
                              for field in dataclasses.fields(GlobalBoxes)))
@@ -81,60 +86,69 @@ class GlobalBoxes:
         return len(self.centres)
 
     def __getitem__(self, index) -> GlobalBoxes:
-        """The boxes under a mask, slice or index array."""
+        """Return the boxes under a mask, slice or index array."""
         return GlobalBoxes(*(getattr(self, field.name)[index]
                              for field in dataclasses.fields(self)))
 
     @property
     def yaws(self) -> np.ndarray:
-        """(K,) radians: where the boxes' lengths point, seen from above."""
-        forward = matrices(self.rotations)[:, :, 0]
+        """Direction (K,) of the boxes' lengths in the x-y plane, radians."""
+        forward = to_matrices(self.rotations)[:, :, 0]
         return np.arctan2(forward[:, 1], forward[:, 0])
 
 
-def usable(rotations: np.ndarray) -> np.ndarray:
-    """(K,) bool: which quaternions (K, 4) matrices() takes."""
+def are_valid_rotations(rotations: np.ndarray) -> np.ndarray:
+    """Return a mask (K,) of the quaternions (K, 4) that to_matrices accepts."""
     with np.errstate(over="ignore"):
         length = np.linalg.norm(rotations, axis=1)
     return (length > 0) & (length <= LARGEST)
 
 
-def matrices(rotations: np.ndarray) -> np.ndarray:
-    """(K, 3, 3) of quaternions (K, 4) [w x y z] of any length but 0."""
+def to_matrices(rotations: np.ndarray) -> np.ndarray:
+    """Convert quaternions (K, 4) [w x y z] of any length above 0 to matrices (K, 3, 3)."""
     if len(rotations) == 0:
         return np.zeros((0, 3, 3))
     return Rotation.from_quat(np.roll(rotations, -1, axis=-1)).as_matrix()
 
 
-def quaternions(rotations: np.ndarray) -> np.ndarray:
-    """(K, 4) [w x y z] of rotation matrices (K, 3, 3)."""
+def to_quaternions(rotations: np.ndarray) -> np.ndarray:
+    """Convert rotation matrices (K, 3, 3) to quaternions (K, 4) [w x y z]."""
     if len(rotations) == 0:
         return np.zeros((0, 4))
     return np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=-1)
 
 
-def in_frame(boxes: GlobalBoxes, pose: np.ndarray) -> np.ndarray:
-    """(K, 7) float64 [x y z l w h yaw] in the frame whose pose (4, 4) leads to the global one. A
-    box that leans in that frame, as the vehicle does on a slope, is set upright."""
-    turn, origin = pose[:3, :3], pose[:3, 3]
-    forward = matrices(boxes.rotations)[:, :, 0] @ turn
+def to_local_boxes(boxes: GlobalBoxes, pose: np.ndarray) -> np.ndarray:
+    """Transform boxes to a frame with the given pose (4, 4) in the global frame.
+
+    Boxes that are tilted in that frame, as on a slope, become upright.
+
+    Returns:
+        (K, 7) float64 [x y z l w h yaw].
+    """
+    rotation, origin = pose[:3, :3], pose[:3, 3]
+    forward = to_matrices(boxes.rotations)[:, :, 0] @ rotation
     yaws = np.arctan2(forward[:, 1], forward[:, 0])
-    return np.column_stack([(boxes.centres - origin) @ turn, boxes.sizes, yaws])
+    return np.column_stack([(boxes.centres - origin) @ rotation, boxes.sizes, yaws])
 
 
-def leaning(boxes: GlobalBoxes, pose: np.ndarray) -> np.ndarray:
-    """(K,) bool: which boxes in_frame sets upright."""
-    upright = in_global(in_frame(boxes, pose), pose)[2]
-    along = np.abs((upright * boxes.rotations).sum(axis=1))
-    return along < (1 - 1e-12) * np.linalg.norm(boxes.rotations, axis=1)
+def are_tilted(boxes: GlobalBoxes, pose: np.ndarray) -> np.ndarray:
+    """Return a mask (K,) of the boxes that to_local_boxes makes upright."""
+    upright = to_global_boxes(to_local_boxes(boxes, pose), pose)[2]
+    alignment = np.abs((upright * boxes.rotations).sum(axis=1))
+    return alignment < (1 - 1e-12) * np.linalg.norm(boxes.rotations, axis=1)
 
 
-def in_global(boxes: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres (K, 3), sizes (K, 3) and rotations (K, 4) in the global frame of boxes (K, 7); the
-    other way round of in_frame."""
+def to_global_boxes(boxes: np.ndarray,
+                    pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Transform boxes (K, 7) to the global frame, the inverse of to_local_boxes.
+
+    Returns:
+        Centres (K, 3), sizes (K, 3) and rotations (K, 4).
+    """
     boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
     yaw, zero = boxes[:, 6], np.zeros(len(boxes))
     cos, sin = np.cos(yaw), np.sin(yaw)
     upright = np.stack([cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1], axis=1)
     return (boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3], boxes[:, 3:6].copy(),
-            quaternions(pose[:3, :3] @ upright.reshape(-1, 3, 3)))
+            to_quaternions(pose[:3, :3] @ upright.reshape(-1, 3, 3)))

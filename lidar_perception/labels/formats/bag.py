@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.data.bag import Bag, KeptOpen
+from lidar_perception.data.bag import Bag, BagHandle
 from lidar_perception.data.bag_poses import BagPoses
-from lidar_perception.data.frame import Frame, frame_id_of
+from lidar_perception.data.frame import Frame, read_frame_id
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels, FrameLabels, to_truth
 from lidar_perception.types import InputError
@@ -38,10 +38,11 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
                              f"{MARKERS} or {DETECTIONS}; give another topic")
         markers = bag.topics[topic] == MARKERS
         found: dict[int, MarkedObjects] = {}
-        poses = BagPoses(KeptOpen(path), frame_id_of(frames))
+        poses = BagPoses(BagHandle(path), read_frame_id(frames))
         for _, time, msg in bag.messages({topic}):
             objects = from_marker_array(msg) if markers else from_detection_array(msg)
-            found[objects.stamp_ns or (0 if 0 in stamps else time)] = poses.brought(objects, topic)
+            stamp_ns = objects.stamp_ns or (0 if 0 in stamps else time)
+            found[stamp_ns] = poses.to_cloud_frame(objects, topic)
     if strange := sorted(found.keys() - stamps):
         raise InputError(f"{path}: {topic} has labels of {strange[0]} ns ({len(strange)} of "
                          f"{len(found)} such), when the drive has no frame; give the drive that "

@@ -16,8 +16,8 @@ import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.kitti.labels import COLUMNS, DONT_CARE, camera_box, lidar_box
-from lidar_perception.data.kitti.write import image_boxes
+from lidar_perception.data.kitti.labels import COLUMNS, DONT_CARE, to_camera_box, to_lidar_box
+from lidar_perception.data.kitti.write import project_boxes
 from lidar_perception.labels.drive_labels import (
     NO_TRACK,
     FrameLabels,
@@ -60,7 +60,7 @@ def frame_labels(frame: Frame, lines: Sequence[dict[str, Any]], where: object) -
     rows: list[Row] = []
     notes: list[tuple[str, dict[str, Any]]] = []
     for line in lines:
-        box = lidar_box(line, to_lidar)
+        box = to_lidar_box(line, to_lidar)
         extra = {key: value for key, value in line.items() if key != "class"}
         if box is None:
             notes.append((line["class"], extra))
@@ -82,12 +82,12 @@ def lines_of(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str, 
     if len(labels):
         calibration = calibration_of(frame)
         to_lidar = np.linalg.inv(calibration.lidar_to_camera)
-        pixels, outside = image_boxes(labels.boxes, calibration)
+        pixels, outside = project_boxes(labels.boxes, calibration)
         occlusion = occlusion_levels(pixels, _depths(labels.boxes, calibration))
     lines = []
     for k, (box, name, extra) in enumerate(zip(labels.boxes, labels.class_names, labels.extra)):
         line = {"class": "_".join(name.split()) or "Misc",
-                **camera_box(box, calibration.lidar_to_camera),
+                **to_camera_box(box, calibration.lidar_to_camera),
                 "bbox": np.nan_to_num(pixels[k]).tolist(), "truncated": float(outside[k]),
                 "occluded": said if isinstance(said := extra.get("occluded"), int)
                 else int(occlusion[k])}
@@ -115,7 +115,7 @@ def _note(name: str, extra: dict[str, Any]) -> dict[str, Any]:
 
 def _as_read(box: np.ndarray, extra: dict[str, Any], to_lidar: np.ndarray) -> bool:
     try:
-        kept = lidar_box(extra, to_lidar)
+        kept = to_lidar_box(extra, to_lidar)
         return (kept is not None and unchanged(box, kept)
                 and np.shape([extra[c] for c in ("truncated", "occluded", "alpha")]) == (3,)
                 and np.shape(extra["bbox"]) == (4,))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.kitti.labels import format_label, parsed_lines
+from lidar_perception.data.kitti.labels import format_label, parse_lines
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
 from lidar_perception.labels.formats.files import check_all_known, frame_files
 from lidar_perception.labels.formats.kitti_lines import frame_labels, label_folder, lines_of
@@ -24,7 +24,7 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     files = frame_files(path, frames, ".txt")
     check_all_known(path, files, ".txt")
     return DriveLabels([frame_labels(
-        frame, [line for _, line in parsed_lines(file)] if file.exists() else [],
+        frame, [line for _, line in parse_lines(file)] if file.exists() else [],
         file) for frame, file in zip(frames, files)])
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.kitti.labels import parsed_tracking_lines
-from lidar_perception.data.kitti.write import tracking_line
+from lidar_perception.data.kitti.labels import parse_tracking_lines
+from lidar_perception.data.kitti.write import format_tracking_line
 from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels, FrameLabels
 from lidar_perception.labels.formats.files import known_drive_files, sequences_of, write_drives
 from lidar_perception.labels.formats.kitti_lines import frame_labels, label_folder, lines_of
@@ -25,7 +25,7 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     for drive, positions in sequences_of(frames).items():
         lines: dict[int, list[dict[str, Any]]] = {frames[i].index: [] for i in positions}
         if drive in files:
-            for number, frame, line in parsed_tracking_lines(files[drive]):
+            for number, frame, line in parse_tracking_lines(files[drive]):
                 if frame not in lines:
                     raise InputError(f"{files[drive]}:{number} is of frame {frame}, and the drive "
                                      f"has {min(lines)} to {max(lines)} ({len(lines)} of them); "
@@ -47,5 +47,5 @@ def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool =
 
 def text_of_frame(labels: FrameLabels, frame: Frame, number: int) -> str:
     """The lines of a frame under this number."""
-    return "".join(tracking_line(number, line.get("track_id", NO_TRACK), line)
+    return "".join(format_tracking_line(number, line.get("track_id", NO_TRACK), line)
                    for line in lines_of(labels, frame, levels=True))

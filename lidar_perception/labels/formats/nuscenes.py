@@ -20,9 +20,15 @@ import numpy as np
 
 from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.nuscenes.boxes import GlobalBoxes, in_frame, in_global, leaning, usable
-from lidar_perception.data.nuscenes.labels import CLASS_OF
-from lidar_perception.data.nuscenes.results import DETECTED, META, places
+from lidar_perception.data.nuscenes.boxes import (
+    GlobalBoxes,
+    are_tilted,
+    are_valid_rotations,
+    to_global_boxes,
+    to_local_boxes,
+)
+from lidar_perception.data.nuscenes.labels import CLASS_BY_NAME
+from lidar_perception.data.nuscenes.results import META, NAME_BY_CLASS, format_boxes
 from lidar_perception.labels.drive_labels import (
     NO_TRACK,
     DriveLabels,
@@ -44,13 +50,13 @@ from lidar_perception.types import InputError
 
 ROOT = "nuscenes"
 NO_SCORE = -1.0    # as nuscenes-devkit writes labels
-OURS = {**CLASS_OF, **{theirs: ours for ours, theirs in DETECTED.items()}}
+OURS = {**CLASS_BY_NAME, **{theirs: ours for ours, theirs in NAME_BY_CLASS.items()}}
 THEIRS = {ours: theirs for theirs, ours in OURS.items()}
 # What is theirs under another name of ours, which stands beside it: vans are cars.
 LIKE = {row.name: THEIRS[row.looks_like] for row in TABLE if row.looks_like in THEIRS}
 WRITTEN = {**THEIRS, **LIKE}
 # What is ours with a rider, and theirs also without one.
-RIDDEN, NOT_RIDDEN = OURS.keys() - CLASS_OF.keys(), "cycle.without_rider"
+RIDDEN, NOT_RIDDEN = OURS.keys() - CLASS_BY_NAME.keys(), "cycle.without_rider"
 OWN = {"sample_token", "translation", "size", "rotation", "velocity", "tracking_id",
        "attribute_name"}
 
@@ -118,9 +124,9 @@ def _in_frame(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], bool]
     """The box, and whether it leans there."""
     width, length, height = row["size"]
     one = GlobalBoxes.of([row["translation"]], [[length, width, height]], [row["rotation"]], 0)
-    if not usable(one.rotations).all():
+    if not are_valid_rotations(one.rotations).all():
         raise ValueError("a rotation is no quaternion")
-    return in_frame(one, pose)[0].tolist(), bool(leaning(one, pose)[0])
+    return to_local_boxes(one, pose)[0].tolist(), bool(are_tilted(one, pose)[0])
 
 
 def rotation_read(labels: FrameLabels, k: int, pose: np.ndarray) -> list[float] | None:
@@ -128,7 +134,7 @@ def rotation_read(labels: FrameLabels, k: int, pose: np.ndarray) -> list[float] 
     rotation, box = labels.extra[k].get("rotation"), labels.boxes[k]
     if not isinstance(rotation, list) or len(rotation) != 4:
         return None
-    centre, size, _ = in_global(box[None], pose)
+    centre, size, _ = to_global_boxes(box[None], pose)
     place = {"translation": centre[0], "size": size[0][[1, 0, 2]], "rotation": rotation}
     with suppress(ValueError, TypeError, OverflowError):  # another tool's field of this name
         return rotation if unchanged(box, _in_frame(place, pose)[0]) else None
@@ -144,7 +150,8 @@ def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
     speeds, names = _velocities(labels, frames, poses), track_names(labels.frames, "tracking_id")
     results = {}
     for i, (each, frame) in enumerate(zip(labels.frames, frames)):
-        placed = places(_token(frame), *in_global(each.boxes, poses[i])) if len(each) else []
+        placed = format_boxes(_token(frame), *to_global_boxes(
+            each.boxes, poses[i])) if len(each) else []
         results[_token(frame)] = [
             {**place, **_columns(task, each, k, poses[i], speeds.get((i, k), [np.nan] * 2), names)}
             for k, place in enumerate(placed)]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.nuscenes.boxes import matrices
+from lidar_perception.data.nuscenes.boxes import to_matrices
 from lidar_perception.types import InputError
 
 LIDAR, CAMERA, FIXED = "lidar", "camera", "odom"
@@ -70,7 +70,7 @@ def regions_of(data: dict[str, Any]) -> list[list[float]]:
 
 def turned(quaternion: Sequence[float]) -> np.ndarray:
     """(3, 3) of [qx qy qz qw]."""
-    return matrices(np.roll(np.array(quaternion, float).reshape(1, 4), 1))[0]
+    return to_matrices(np.roll(np.array(quaternion, float).reshape(1, 4), 1))[0]
 
 
 def _turned(x: float, y: float, z: float) -> np.ndarray:

@@ -203,7 +203,7 @@ class BagPlayer(LidarNode):
     def _play_once(self) -> None:
         self._publish_latched()
         self.now_ns, self.anchor = self.start_ns, monotonic()
-        for topic, stamp, data in self.bag.raw(self.publishers_by_topic, self.start_ns,
+        for topic, stamp, data in self.bag.raw_messages(self.publishers_by_topic, self.start_ns,
                                                self.stop_ns):
             if not self._wait_until(stamp, topic):
                 return
@@ -249,7 +249,7 @@ class BagPlayer(LidarNode):
         before: dict[str, deque[bytes]] = {}
         latched = {t for t in self.publishers_by_topic if self._latched(t)}
         if self.start_ns > self.bag.start_ns and latched:
-            for topic, _, data in self.bag.raw(latched, None, self.start_ns):
+            for topic, _, data in self.bag.raw_messages(latched, None, self.start_ns):
                 before.setdefault(topic, deque(maxlen=self._held(topic))).append(data)
         for topic, messages in before.items():
             for data in messages:

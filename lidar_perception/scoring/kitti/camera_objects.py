@@ -9,7 +9,7 @@ import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.kitti.labels import to_labels
-from lidar_perception.data.kitti.write import image_boxes
+from lidar_perception.data.kitti.write import project_boxes
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import Detections, GroundTruth, InputError, class_ids
 
@@ -85,7 +85,7 @@ def camera_objects(objects: GroundTruth, calibration: Calibration | None) -> Cam
         return _without_camera(objects, scores[:len(objects)])
     labels = to_labels(objects, calibration.lidar_to_camera)
     projected, outside = np.zeros((len(labels), 4)), np.zeros(len(labels))
-    pixels, outside[:len(objects)] = image_boxes(objects.boxes, calibration)
+    pixels, outside[:len(objects)] = project_boxes(objects.boxes, calibration)
     projected[:len(objects)] = np.nan_to_num(pixels)
 
     given = _columns(labels, "bbox", 4)

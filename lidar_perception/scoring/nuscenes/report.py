@@ -12,13 +12,13 @@ import numpy as np
 
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.nuscenes.boxes import NAMES, GlobalBoxes
-from lidar_perception.data.nuscenes.results import DETECTED, read_results, to_results
+from lidar_perception.data.nuscenes.results import NAME_BY_CLASS, read_results, to_results
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.scoring.detections import detected
 from lidar_perception.scoring.nuscenes.protocol import ClassScores, class_scores, counted, summary
 from lidar_perception.types import InputError
 
-OURS = tuple(DETECTED.values())
+OURS = tuple(NAME_BY_CLASS.values())
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def key_frame(frame: Frame, boxes: GlobalBoxes, ms: float | None = None,
     labels = key.labels()
     if labels is None:
         return KeyFrameResult(key.token, boxes, None, None, ms, problem)
-    racks = labels.racks()
+    racks = labels.bicycle_racks()
     return KeyFrameResult(key.token, boxes, labels.boxes[counted(labels.boxes, key.ego, racks)],
                           boxes[counted(boxes, key.ego, racks)], ms, problem)
 
@@ -105,7 +105,8 @@ class NuscenesReport:
         result = {"frames": self.frames, "classes": {}, "all": None, "ours": None,
                   "ms": float(np.median(self.ms)) if self.ms else None, "skipped": self.skipped}
         if self.frames:
-            truth, found = (GlobalBoxes.together(parts) for parts in (self.truth, self.detections))
+            truth, found = (GlobalBoxes.concatenate(parts)
+                            for parts in (self.truth, self.detections))
             numbers = [np.repeat(np.arange(self.frames), [len(part) for part in parts])
                        for parts in (self.truth, self.detections)]
             scores = {name: class_scores(name, truth, numbers[0], found, numbers[1])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.camera import Calibration
-from lidar_perception.data.drives import goes_on
+from lidar_perception.data.drives import is_same_drive
 from lidar_perception.scoring.recorded import Answered
 from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
@@ -37,7 +37,7 @@ def recorded_tracks(frames: Sequence[Answered], calibration: Calibration | None
     report, drive, before = TrackingReport(), 0, 0
     try:
         for i, frame in enumerate(frames):
-            drive += not goes_on(before, frame.stamp_ns)
+            drive += not is_same_drive(before, frame.stamp_ns)
             before = frame.stamp_ns
             report.update(observe(f"drive {drive}", i, to_truth(frame.truth), tracked_labels(
                 np.asarray(frame.found.ids), to_detections(frame.found)), calibration))

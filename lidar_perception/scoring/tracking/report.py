@@ -62,7 +62,7 @@ def _by_tracker(open_: Callable[[], Detector], params: TrackingParams, ego: str,
         truth = frame.truth()
         if truth is not None:
             ids_of(truth, "label")  # before the detector's work
-        frame = frame.loaded_once()
+        frame = frame.with_cached_scan()
         tracks = tracker(frame, detector(frame.load()).detections)
         if truth is None:
             return None
