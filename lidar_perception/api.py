@@ -190,7 +190,7 @@ def evaluate(detector: str | Path | Detector | Callable[[LidarFrame], Detections
     else:
         loaded = as_detector(detector)
         loaded = loaded if min_score is None else loaded.with_min_score(min_score)
-    report = DetectionReport(follow=recording.drives)
+    report = DetectionReport(follow=recording.is_sequential)
     numbers = range(min(len(recording), limit or len(recording)))
     for _, result in results(recording, by_detector(lambda: loaded), numbers):
         if isinstance(result, Skipped):
