@@ -211,15 +211,15 @@ class Detections:
     def of(boxes: ArrayLike, class_ids: ArrayLike = PEDESTRIAN,
            scores: ArrayLike = 1.0) -> Detections:
         """Return detections of boxes (K, 7) [x y z l w h yaw], of any real type; one box may be
-        (7,). class_ids into CLASSES and scores are (K,), or one number for all. InputError for
-        other shapes."""
+        (7,). class_ids are indices into CLASSES or names of classes, such as "Pedestrian"; they
+        and scores are (K,), or one for all. InputError for other shapes and unknown names."""
         given = _numbers(boxes, "boxes", "numbers (K, 7) [x y z l w h yaw]")
         if given.ndim > 2 or (given.size and given.shape[-1:] != (7,)):
             raise InputError(f"boxes have shape {given.shape}; allowed is (K, 7) "
                              "[x y z l w h yaw]")
         boxes = np.ascontiguousarray(given, np.float32).reshape(-1, 7)
         count, columns = len(boxes), []
-        for name, column in (("class_ids", np.asarray(class_ids, np.int32)),
+        for name, column in (("class_ids", _to_class_ids(class_ids)),
                              ("scores", np.asarray(scores, np.float32))):
             if column.shape not in ((), (1,), (count,)):
                 raise InputError(f"{name} have shape {column.shape} for {count} boxes; give "
@@ -234,6 +234,11 @@ class Detections:
     def __len__(self) -> int:
         return len(self.boxes)
 
+    @property
+    def labels(self) -> list[str]:
+        """Names of the classes."""
+        return [CLASSES[i] for i in self.class_ids]
+
     def __getitem__(self, index: np.ndarray | slice) -> Detections:
         """The detections under a mask, slice or index array."""
         return Detections(self.boxes[index], self.class_ids[index], self.scores[index],
@@ -244,6 +249,17 @@ class Detections:
         return Detections(np.concatenate([self.boxes, others.boxes]),
                           np.concatenate([self.class_ids, others.class_ids]),
                           np.concatenate([self.scores, others.scores]))
+
+
+def _to_class_ids(given: ArrayLike) -> np.ndarray:
+    """Return indices into CLASSES of indices or names, in an array of the same shape."""
+    values = np.asarray(given)
+    if values.dtype.kind != "U":
+        return np.asarray(given, np.int32)
+    for name in values.flat:
+        if class_name(name) not in CLASSES:
+            raise unknown_name("class", name, CLASSES)
+    return np.array(class_ids(values.flat), np.int32).reshape(values.shape)
 
 
 def class_ids(names: Iterable[str]) -> list[int]:

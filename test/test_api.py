@@ -76,7 +76,7 @@ def test_ground_and_clusters_equal_those_of_the_core():
     (lambda xyz: lp.simulate(scene="stret"), "did you mean 'street'"),
     (lambda xyz: lp.simulate(sensor="vpl-16"), "vlp-16"),
     (lambda xyz: lp.evaluate(NearestBox, lp.simulate(1)), "give an instance"),
-    (lambda xyz: lp.evaluate(NearestBox(), "nowhere"), "there is no nowhere"),
+    (lambda xyz: lp.evaluate(NearestBox(), "nowhere"), "nowhere does not exist"),
 ])
 def test_bad_argument_is_named_in_one_line(call, words):
     with pytest.raises(InputError, match=words) as error:
@@ -116,6 +116,14 @@ def test_evaluate_refuses_recording_without_labels(tmp_path):
     np.save(tmp_path / "cloud.npy", scene(0))
     with pytest.raises(InputError, match="labelled boxes"):
         lp.evaluate(NearestBox(), tmp_path / "cloud.npy")
+
+
+def test_detections_take_names_of_classes():
+    boxes = np.zeros((2, 7))
+    assert lp.Detections.of(boxes, "car").labels == ["Car", "Car"]
+    assert lp.Detections.of(boxes, ["Cyclist", "Pedestrian"]).labels == ["Cyclist", "Pedestrian"]
+    with pytest.raises(InputError, match="did you mean 'Pedestrian'"):
+        lp.Detections.of(boxes, "Pedestrain")
 
 
 def test_tracker_follows_detections():

@@ -264,7 +264,7 @@ def test_mypy_ignores_no_module():
     settings.read(ROOT / "setup.cfg")
     asked = {name: dict(settings[name]) for name in settings if name.startswith("mypy")}
     assert asked["mypy"]["files"] == (
-        "lidar_perception, lidar_studio, msg_utils, scripts, benchmark, experiments")
+        "lidar_perception, lidar_studio, msg_utils, scripts, benchmark, experiments, examples")
     assert {name for name, options in asked.items()
             if {"ignore_errors", "exclude", "follow_imports"} & set(options)} == {"mypy-launch"}
     assert [name for name in SOURCES if "# mypy:" in (ROOT / name).read_text()] == []

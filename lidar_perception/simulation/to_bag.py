@@ -67,4 +67,4 @@ def simulated_recording(seed: int, frames: int, sensor: Sensor = HDL64E,
     has = {BOXES, POSES} | ({CAMERA} if scenes.camera else set())
     return Recording(Path("simulation"), f"simulated {scenes.scene}",
                      SimulatedFrames(seed, frames, sensor, None, scenes), frozenset(has),
-                     timed=True)
+                     has_times=True)
