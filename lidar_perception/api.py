@@ -174,8 +174,9 @@ def evaluate(detector: str | Path | Detector | Callable[[LidarFrame], Detections
         intervals: number of bootstrap resamples for 90 % intervals; 0: none.
 
     Returns:
-        The content of the JSON file of `evaluate detection`. result["ap"]["Car"]["3d"]["moderate"]
-        ["r40"] is an average precision in percent; "skipped" lists frames that were not scored.
+        The content of the JSON file of `evaluate detection`, such as
+        `result["ap"]["Car"]["3d"]["moderate"]["r40"]`, an average precision in percent. `skipped`
+        lists the frames that were not scored.
 
     Raises:
         InputError: the recording or the detector cannot be used, or no frame has labels.
