@@ -66,10 +66,11 @@ def carry_out(copy: Path, name: str) -> list[str]:
     return [path for path, _, _ in chosen(name)]
 
 
-def run(copy: Path, *arguments) -> str:
+def run(copy: Path, *arguments, folder: Path | None = None) -> str:
+    """Run a command with the package at `copy`, in that or another folder."""
     environment = {**os.environ, "PYTHONPATH": str(copy), "COLUMNS": "200"}
     done = subprocess.run([sys.executable, "-m", "lidar_perception.cli.main", *map(str, arguments)],
-                          cwd=copy, env=environment, capture_output=True, text=True)
+                          cwd=folder or copy, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout + done.stderr
 
@@ -87,6 +88,17 @@ def test_a_data_set_is_one_file_and_one_entry(copy, tmp_path):
     np.save(tmp_path / "clouds" / "0.boxes.npy", [[8, 0.5, -0.85, 0.5, 0.5, 1.7, 0.3]])
     said = run(copy, "convert", tmp_path / "clouds", "--out", tmp_path / "bag")
     assert "folder of .npy clouds, 2 frames" in said and "2 scans of 2" in said
+
+
+def test_detector_is_a_class_in_your_own_file(tmp_path):
+    source, = re.findall(r"`my_detector.py`:\n\n```python\n(.*?)```", PAGE, re.S)
+    (tmp_path / "my_detector.py").write_text(source)
+    said = run(ROOT, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"),
+               "--weights", "my_detector:TallClusters", folder=tmp_path)
+    assert "2 frames" in said and "Ped" in said
+    run(ROOT, "detect", tmp_path / "kitti", "--weights", "my_detector:TallClusters", "--out",
+        tmp_path / "results", folder=tmp_path)
+    assert "Pedestrian" in (tmp_path / "results" / "detections.json").read_text()
 
 
 def test_a_detector_is_one_folder_and_one_entry(copy, tmp_path):
@@ -108,7 +120,7 @@ def test_a_class_is_one_row_that_all_networks_of_the_package_go_on_with(copy, tm
     known, row = file.read_text(), '    ObjectClass("Truck", vehicle=True),\n'
     assert row in known
     file.unlink()  # it is a link to the original
-    numbers = "Numbers((8.0, 2.5, 3.2), 0.6, 0.45, (8.0, 2.5, 3.2), 5.0, 0.7, 0.5)"
+    numbers = "DetectionNumbers((8.0, 2.5, 3.2), 0.6, 0.45, (8.0, 2.5, 3.2), 5.0, 0.7, 0.5)"
     file.write_text(known.replace(row, row.replace("vehicle", f"{numbers}, vehicle")))
     said = run(copy, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"))
     assert "2 frames" in said and "Truck" in said
