@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import json
+from dataclasses import replace
 from importlib.resources import files
 from typing import Any
 
@@ -25,7 +26,6 @@ from lidar_perception.candidates.silhouette import (
     count_pixels,
     draw_silhouettes,
 )
-from lidar_perception.param_fields import with_values
 
 SHAPE_KNOTS = {  # feature -> knots of its curve, which is constant beyond the first and the last
     "range_m": (5, 10, 15, 20, 30, 40, 55),
@@ -63,10 +63,10 @@ def compute_shape_features(xyz: np.ndarray, start: np.ndarray, boxes: np.ndarray
         fill: drawn share of the rectangle height x length.
         lopsided: distance of the median from the middle of the extent, divided by the length.
     """
-    stm = {"stm.window": "metric", "stm.spread": True, "stm.dilations": 0, "stm.axis": "yaw"}
+    stm = replace(params.stm, window="metric", spread=True, dilations=0, axis="yaw")
     floors = boxes[:, 2].astype(float) - boxes[:, 5] / 2
     drawn = count_pixels(draw_silhouettes(xyz, start, np.ones((len(boxes), 1)), floors,
-                                          with_values(params, stm))) * PIXEL_AREA_M2
+                                          replace(params, stm=stm))) * PIXEL_AREA_M2
     count = np.diff(start)
     ranges, low, high, spread, length, width, middle = _compute_moments(
         np.ascontiguousarray(xyz, np.float32), np.asarray(start, np.int64)).T

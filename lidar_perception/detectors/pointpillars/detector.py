@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple, Protocol
@@ -192,7 +193,8 @@ class PointPillarsDetector(NetworkDetector):
         best: dict[str, float] = {}
         broken: str | None = None
         scored = [said.logits for said in predictions.values() if len(said.logits)]
-        if any(len(logits) > 1 and (logits == logits[0]).all() for logits in scored):
+        if any(len(logits) > 1 and torch.equal(logits[0], logits[-1])
+               and (logits == logits[0]).all() for logits in scored):
             boxes, best_logits, labels = boxes[:0], best_logits[:0], labels[:0]
             broken = ("the network gives every place the same scores; the weights are broken, "
                       "take others")
@@ -207,7 +209,9 @@ class PointPillarsDetector(NetworkDetector):
         """The boxes of one look whose score suffices, turned back."""
         logits = prediction.logits
         limits = logits.new_tensor([*map(_logit, self.raw_min_scores())])
-        chosen = torch.nonzero((logits >= limits).any(dim=1))[:, 0]
+        # One class after the other: a reduction over three columns takes three times as long.
+        passes = reduce(torch.logical_or, map(torch.ge, logits.unbind(dim=1), limits))
+        chosen = torch.nonzero(passes)[:, 0]
         best, labels = logits[chosen].max(dim=1)
         valid = torch.nonzero(best >= limits[labels])[:, 0]
         if len(valid) > self.settings.nms.candidates:
