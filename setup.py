@@ -80,8 +80,8 @@ setup(
     packages=find_packages(include=["lidar_perception*", "lidar_studio*", "msg_utils*"]),
     package_data={
         NAME: ["py.typed", "nodes/*.xml", "candidates/*.json", "*/*.html",
-               "simulation/sensors/*.yaml", "detectors/fused/*.json", "detectors/pointnet/weights/*",
-               "detectors/pointpillars/weights/pointpillars_v4_*"],
+               "simulation/sensors/*.yaml", "detectors/fused/*.json",
+               "detectors/pointnet/weights/*", "detectors/pointpillars/weights/pointpillars_v4_*"],
         "lidar_studio": ["py.typed", "page/*"],
         "msg_utils": ["py.typed"],
     },

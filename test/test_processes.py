@@ -42,7 +42,7 @@ def counting() -> Callable[[int], int]:
 
 
 def result_of(script: str, **environment: str) -> subprocess.CompletedProcess:
-    path = os.pathsep.join(map(str, (ROOT, ROOT / "test")))
+    path = os.pathsep.join(map(str, (ROOT, ROOT / "test", ROOT / "test/support")))
     return subprocess.run([sys.executable, "-c", script], text=True, capture_output=True,
                           env={**os.environ, "PYTHONPATH": path, **environment}, check=False)
 

@@ -6,3 +6,8 @@ reason, or fails. test_fuzz.py runs a few cases of every part; for long runs, in
     ../.venv/bin/python -m fuzz messages --minutes 20 --seed 1
     ../.venv/bin/python -m fuzz files --first 17 --cases 1
 """
+
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[1] / "support"))  # for runs without pytest

@@ -1,5 +1,7 @@
-"""Prints how far the measured sensors of tilted_samples.MOUNTS are from the truth, as in
-docs/how-to/own-sensor.md: PYTHONPATH=.:test python test/sensor_setup/truth_table.py [--uneven]"""
+"""Print how far the measured sensors of tilted_samples.MOUNTS are from the truth:
+
+    PYTHONPATH=.:test/support python test/sensor_setup/truth_table.py [--uneven]
+"""
 
 from __future__ import annotations
 

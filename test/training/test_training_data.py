@@ -245,8 +245,7 @@ def test_workers_end_when_main_process_is_killed():
               "    print(pids[0], flush=True)\n"
               "    input()\n")
     with subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parent, text=True,
-                          env={**os.environ, "PYTHONPATH": os.pathsep.join(
-                              map(str, Path(__file__).parents[1:3]))},
+                          env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
                           stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                           stderr=subprocess.DEVNULL) as run:
         worker = Path(f"/proc/{int(run.stdout.readline())}/stat")

@@ -48,7 +48,7 @@ each_make = pytest.mark.parametrize("make", [
 ])
 
 # Real scans that lie beside the checkout, never in it.
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="real data is not beside the checkout "
                                 "(../shared/data)")
 
