@@ -255,7 +255,7 @@ def test_scans_of_one_stamp_are_all_there_and_labels_go_to_no_other_scan(tmp_pat
     truth = GroundTruth.of(np.ones((1, 7)), [CAR])
     assert write_bag(tmp_path / "bag", [replace(f, truth=lambda: truth) for f in twice],
                      skipped=skipped) == 2
-    assert "another labelled scan has its stamp" in skipped[0]
+    assert "another labelled scan has the same stamp" in skipped[0]
     unset = [replace(f, stamp_ns=0) for f in frames_at([0, 1])]
     with BagWriter(tmp_path / "unset") as bag:  # a driver that sets no stamp
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")

@@ -267,7 +267,7 @@ def test_it_waits_until_a_node_of_ours_has_met_who_listens_to_it(processes, peer
 
 BAD = {
     "nothing": ({"bag": ""}, "'bag' is empty"),
-    "nowhere": ({"bag": "/nowhere"}, "no bag /nowhere"),
+    "nowhere": ({"bag": "/nowhere"}, "the bag /nowhere does not exist"),
     "topic": ({"topics": ["/other"]}, "no topic /other"),
     "remap": ({"remap": ["/text"]}, "OLD:=NEW"),
     "bad_name": ({"remap": ["/text:=a b"]}, "'a b' is no name of a topic"),

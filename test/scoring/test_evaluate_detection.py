@@ -283,7 +283,7 @@ def test_what_is_missing_is_named(kitti, found, tmp_path, monkeypatch, capsys):
     split = write(tmp_path / "split.txt", "000001 000007 000008")
     line = error("--results", found, "--split", split)
     assert "names 000007 (2 unknown)" in line and str(kitti) in line
-    assert "names no frame" in error("--results", found, "--split", write(split, "\n"))
+    assert "is empty" in error("--results", found, "--split", write(split, "\n"))
     (found / "000001.txt").unlink()
     assert f"result file {found / '000001.txt'} does not exist" in error("--results", found)
     write(kitti / "training/label_2/000000.txt", "Car 1 2 3")

@@ -202,7 +202,7 @@ def test_scene_files_that_are_wrong_are_named(root, tmp_path, monkeypatch, capsy
     scenes = tmp_path / "scenes.txt"
     assert "cannot read the split" in error(scenes)
     scenes.write_text("\n")
-    assert "names no frame" in error(scenes)
+    assert "is empty" in error(scenes)
     scenes.write_text("scene-0103\nscene-9999\n")
     assert "names scene-9999 (1 unknown)" in error(scenes)
 

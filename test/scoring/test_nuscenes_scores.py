@@ -229,7 +229,7 @@ def test_turning_and_moving_the_world_changes_nothing(tmp_path):
     moved = copy.deepcopy(results)
     for row in [*tables["ego_pose"], *tables["sample_annotation"], *itertools.chain(
             *moved.values())]:
-        row["rotation"] = folder.wxyz(turn * folder.turn(row))
+        row["rotation"] = folder.to_wxyz(turn * folder.to_rotation(row))
         row["translation"] = (turn.apply(row["translation"]) + [30, -200, 0]).tolist()
         if "velocity" in row:
             row["velocity"] = turn.apply([*row["velocity"], 0])[:2].tolist()
@@ -262,13 +262,13 @@ def spoil(**values):
     (lambda r: r.update(s0k0=r["s0k0"] * 100), "at most 500 boxes"),
     (lambda r: r.update(s0k0={}), "needs a list"),
     (lambda r: r["s0k0"][0].pop("size"), "a box has no 'size'"),
-    (spoil(detection_name="van"), "the class 'van' is none of"),
-    (spoil(attribute_name="red"), "cannot be"),
+    (spoil(detection_name="van"), "the class 'van' is not one of"),
+    (spoil(attribute_name="red"), "is malformed"),
     (spoil(size=[1, 2, 0]), "sizes above 0"), (spoil(rotation=[0, 0, 0, 0]), "a quaternion"),
-    (spoil(translation=[1, 2, math.nan]), "must be finite"), (spoil(size=[1]), "cannot be read"),
-    (spoil(velocity=[math.inf, 0]), "velocity finite or NaN"), (spoil(velocity=[0]), "cannot be"),
-    (spoil(detection_score="high"), "cannot be read"),
-    (spoil(translation=[10**400, 0, 0]), "cannot be read"),
+    (spoil(translation=[1, 2, math.nan]), "must be finite"), (spoil(size=[1]), "is malformed"),
+    (spoil(velocity=[math.inf, 0]), "velocity finite or NaN"), (spoil(velocity=[0]), "is malformed"),
+    (spoil(detection_score="high"), "is malformed"),
+    (spoil(translation=[10**400, 0, 0]), "is malformed"),
     (spoil(rotation=[1e308, 0, 0, 0]), "a quaternion"),
 ])
 def test_results_that_are_wrong_are_named(tmp_path, change, words):

@@ -90,7 +90,7 @@ def test_split_file_selects_frames(tmp_path):
     split = write(tmp_path / "train.txt", "000003\n000001\n")
     assert open_labelled_frames(root, split).to_scenes().names == ("000003", "000001")
     assert len(open_labelled_frames(root).frames) == 4
-    for text, reason in (("000009", "000009"), ("", "names no frame")):
+    for text, reason in (("000009", "000009"), ("", "is empty")):
         with pytest.raises(InputError, match=reason):
             open_labelled_frames(root, write(split, text))
     with pytest.raises(InputError, match="cannot read the split"):
