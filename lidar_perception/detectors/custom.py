@@ -25,7 +25,6 @@ from lidar_perception.param_fields import Params
 from lidar_perception.robot.params import CropParams
 from lidar_perception.types import (
     CLASSES,
-    SENSOR_HEIGHT,
     Detections,
     InputError,
     LidarFrame,
@@ -157,13 +156,14 @@ def entry_point_names() -> list[str]:
 
 
 def load_custom_detector(reference: str, device: str = "auto", range: str = "auto",
-                         sensor_height: float = SENSOR_HEIGHT) -> CustomDetector:
+                         params: Any = None, group: str = "custom") -> CustomDetector:
     """Load the detector of a class, whose instances return Detections for a PointCloud.
 
     Args:
         reference: "module:Class". The module is on Python's path or in the current folder.
-        device, range, sensor_height: passed on if the class takes an argument of that name;
-            sensor_height is in metres.
+        device, range: passed on if the class takes an argument of that name, as is the
+            sensor_height of the parameters, in metres.
+        params, group: see CustomDetector. Default: CustomDetectorParams.
 
     Raises:
         InputError: the module or the class is missing or fails, or the class does not take the
@@ -189,9 +189,10 @@ def load_custom_detector(reference: str, device: str = "auto", range: str = "aut
         return detector
 
     takes_height = "sensor_height" in taken
-    adapter = CustomDetector(reference, lambda height: build(height if takes_height else None),
-                             device=device).mounted_at(sensor_height)
-    return replace(adapter, classes=_find_classes(reference, adapter.build(sensor_height)))
+    params = CustomDetectorParams() if params is None else params
+    first = build(params.ground.sensor_pose.height if takes_height else None)
+    return CustomDetector(reference, lambda height: build(height if takes_height else None),
+                          _find_classes(reference, first), params, group, device)
 
 
 def _find_class(reference: str) -> Callable[..., Any]:

@@ -17,9 +17,10 @@ from lidar_perception.detectors.custom import (
     load_custom_detector,
 )
 from lidar_perception.detectors.params import RANGE_CHOICES
+from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.compiling import compilation_reported
-from lidar_perception.types import SENSOR_HEIGHT, InputError, unknown_name
+from lidar_perception.types import InputError, unknown_name
 
 if TYPE_CHECKING:
     from lidar_perception.detectors.checkpoint import Header
@@ -85,8 +86,9 @@ def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
         raise InputError(f"{kind}.weights is set, and {path} is given too; give one of them")
     try:
         if reference is not None:
-            detector: Any = load_custom_detector(reference, device, range, SENSOR_HEIGHT if
-                                                 sensor_height is None else sensor_height)
+            own = CustomDetectorParams() if sensor_height is None else set_sensor_height(
+                CustomDetectorParams(), sensor_height)
+            detector: Any = load_custom_detector(reference, device, range, own)
         elif kind in PARAMS:
             own = settings.get("pointnet.weights") if kind == POINTNET else None
             params = with_values(default_params(own or weights), {**asked, **settings})

@@ -5,9 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lidar_perception.detectors.custom import find_reference, load_custom_detector
 from lidar_perception.detectors.fused.fusion import weights_file
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams
 from lidar_perception.nodes.detector_node import DetectorNode
+from lidar_perception.nodes.outputs import DetectionOutputs
+from lidar_perception.nodes.runtime import CLOUD
+from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import DetectionNodeParams
 
 if TYPE_CHECKING:
@@ -23,6 +27,20 @@ class FusedNode(DetectorNode):
 
     def __init__(self, **options: Any):
         super().__init__("fused_detector", FusedDetectorParams(), DetectionNodeParams(), **options)
+
+    def configure(self) -> None:
+        """Load the networks, or the class that fused.weights names as module:Class."""
+        if (reference := find_reference(self.params.fused.weights)) is None:
+            super().configure()
+            return
+        self.sensor = SensorCheck(self)
+        self.outputs = DetectionOutputs(self, self.steps)
+        self.detector = load_custom_detector(
+            reference, self.params.fused.device, self.params.fused.range,
+            params=self.params, group=self.group)
+        self.counts.update(network=f"{reference}, {' '.join(self.detector.classes)}",
+                           device=self.detector.device)
+        self.input("points", CLOUD, self.on_points)
 
     def weights(self) -> Path:
         return weights_file(self.params.fused)

@@ -16,8 +16,10 @@ from test_bad_input import BAD, cloud
 from lidar_perception.detectors.fused.detector import load_fused_detector
 from lidar_perception.detectors.fused.fusion import package_models, write_fusion
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams
+from lidar_perception.nodes.fused_detector import FusedNode
 from lidar_perception.nodes.graph import graph_of
 from lidar_perception.param_fields import with_values
+from msg_utils.markers import from_marker_array
 
 NODE = "fused_detector"
 FILE = Path(__file__).resolve().parents[2] / "config" / "fused.param.yaml"
@@ -72,3 +74,26 @@ def test_no_cloud_ends_the_detector(talker, found, shared_processes, shared_peer
     assert_equal(received(found, 7), DETECTOR.offline(weights, message(7)))
     log = shared_processes.log(NODE)
     assert "Traceback" not in log and "Warning" not in log
+
+
+def test_node_runs_class_of_your_own(start, tmp_path, monkeypatch):
+    (tmp_path / "own_fused.py").write_text("""
+import lidar_perception as lp
+
+class Posts:
+    classes = ("Pedestrian",)
+    def __init__(self, sensor_height):
+        self.sensor_height = sensor_height
+    def __call__(self, cloud):
+        boxes = [[5, 0, 0, 1, 1, self.sensor_height, 0], [9, 0, 0, 1, 1, 1, 0]]
+        return lp.Detections.of(boxes, "Pedestrian", [0.9, 0.2])
+""")
+    from rclpy.serialization import deserialize_message
+    from visualization_msgs.msg import MarkerArray
+    monkeypatch.syspath_prepend(tmp_path)
+    node = start(FusedNode, **{"fused.weights": "own_fused:Posts",
+                               "ground.sensor_pose.height": 0.5, "fused.warm_up": False})
+    node.on_points(message(1))
+    found = from_marker_array(deserialize_message(node.sent["detections"][-1], MarkerArray))
+    assert found.labels == ["Pedestrian"] and found.boxes[0, 5] == pytest.approx(0.5)
+    assert node.counts["network"] == "own_fused:Posts, Pedestrian"

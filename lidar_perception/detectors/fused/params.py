@@ -28,8 +28,9 @@ class FusedParams(NetworkParams):
     """What proposes, what judges, and what counts as a detection. A score is the probability that
     the object is there."""
 
-    weights: str = param("", "File of `train fused`, which names both networks; or a checkpoint of "
-                         "PointPillars. Empty: what comes with the package.", fixed=True)
+    weights: str = param("", "File of `train fused`, which names both networks; a checkpoint of "
+                         "PointPillars; or a class of your own, module:Class. Empty: what comes "
+                         "with the package.", fixed=True)
 
     classifier: str = param("", "Checkpoint of the cluster network; empty: the one that comes with "
                             "the package.", fixed=True)
