@@ -86,9 +86,9 @@ def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
         raise InputError(f"{kind}.weights is set, and {path} is given too; give one of them")
     try:
         if reference is not None:
-            own = CustomDetectorParams() if sensor_height is None else set_sensor_height(
+            custom = CustomDetectorParams() if sensor_height is None else set_sensor_height(
                 CustomDetectorParams(), sensor_height)
-            detector: Any = load_custom_detector(reference, device, range, own)
+            detector: Any = load_custom_detector(reference, device, range, custom)
         elif kind in PARAMS:
             own = settings.get("pointnet.weights") if kind == POINTNET else None
             params = with_values(default_params(own or weights), {**asked, **settings})
