@@ -88,7 +88,7 @@ def test_a_mutated_header_is_used_or_refused_with_one_line(kind, tmp_path):
     tensors = make(header.config).state_dict()
     path, text, rng = tmp_path / "w.safetensors", json.loads(header.text()), random.Random(7)
     scan, refused = frame(), 0
-    texts = [json.dumps(mutated(text, rng)) for _ in range(250)]
+    texts = [json.dumps(mutated(text, rng)) for _ in range(60)]
     texts += ["[" * 100_000, '{"format":' * 50_000, "1" * 5000, "", "null", "\ud83d".encode(
         "utf-8", "replace").decode(), json.dumps({**text, "format": [1]})]
     for one in texts:
@@ -100,7 +100,7 @@ def test_a_mutated_header_is_used_or_refused_with_one_line(kind, tmp_path):
         except InputError as error:
             refused += 1
             assert str(path) in str(error) and "\n" not in str(error) and len(str(error)) < 400
-    assert 100 < refused < len(texts)
+    assert 25 < refused < len(texts)
 
 
 def test_a_header_takes_no_memory_before_the_tensors_fit_it(tmp_path):

@@ -50,7 +50,7 @@ def scans(streets):
 def test_each_finds_most_cars_that_are_plain_to_see(file, scans):
     detector = open_detector(file, "cpu")
     found = hits = 0
-    for scan in scans:
+    for scan in scans[2:] if "full" in file.stem else scans[1:]:  # these are slow
         cars = scan.truth.class_ids == CLASSES.index("Car")
         plain = np.array([e["num_points"] > 100 and e["visible"] > 0.5 for e in scan.truth.extras])
         ahead = (scan.truth.boxes[:, 0] > 5) & (scan.truth.boxes[:, 0] < 35) & (
@@ -60,7 +60,7 @@ def test_each_finds_most_cars_that_are_plain_to_see(file, scans):
         mine = detections.boxes[detections.class_ids == CLASSES.index("Car")]
         found += len(boxes)
         hits += len(match_centres(mine[:, :3], boxes[:, :3], 1.0)[0])
-    assert found >= 4 and hits >= 0.7 * found
+    assert found >= 6 and hits >= 0.7 * found
 
 
 @pytest.mark.parametrize("name", ["pointnet", "fused"])

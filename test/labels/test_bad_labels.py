@@ -142,7 +142,7 @@ def test_numbers_that_are_none_never_become_labels():
 @pytest.mark.parametrize("key", ["rotation", "tracking_id", "uid", "truncated", "openlabel_cuboid"])
 def test_fields_of_another_tool_are_kept_or_refused_in_one_line(key, format, tmp_path):
     frames = drive("one")
-    for value in None, 5, "x", [], {}, [0] * 4, ["a"] * 4, [10**400] * 4, [1, 0, 0, 0]:
+    for value in None, "x", {}, [0] * 4, [10**400] * 4, [1, 0, 0, 0]:
         labels = DriveLabels([FrameLabels.of(frame.name, frame.stamp_ns, [[5, 1, 0, 4, 2, 1, 0.1]],
                                              ["Car"], [3], [0.5], [{key: value}])
                               for frame in frames])

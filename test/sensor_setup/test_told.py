@@ -57,8 +57,7 @@ def told(poses, actual, said=None, height=None):
                 {i: pose @ invert_pose(actual) for i, pose in enumerate(poses)})
 
 
-@pytest.mark.parametrize("yaw", [0, *(pytest.param(yaw, marks=pytest.mark.no_cover)
-                                      for yaw in (90, -150))])
+@pytest.mark.parametrize("yaw", [0, pytest.param(-150, marks=pytest.mark.no_cover)])
 def test_with_odometry_ahead_is_where_the_base_looks_whichever_way_it_drove(yaw):
     """The sensor's x is at yaw in the base, so the base's x is at -yaw in the sensor."""
     _, poses = drive()
@@ -69,8 +68,9 @@ def test_with_odometry_ahead_is_where_the_base_looks_whichever_way_it_drove(yaw)
         assert not any("by TF, x of" in line for line in doubts(m))
         looks = node_params(m).get("input.ahead", (0.0,))[0]
         assert abs((looks + yaw + 180) % 360 - 180) < 3
-    assert abs(abs(found(Told(), backwards=True).heading.degrees) - 180) < 3  # it cannot know
     if not yaw:
+        without = found(Told(), backwards=True)
+        assert abs(abs(without.heading.degrees) - 180) < 3  # it cannot know
         report_html(m, {"robot.param.yaml": params_yaml(m)})
     written = yaml.safe_load(params_yaml(m))["/**"]["ros__parameters"]["input"]
     assert written.pop("ahead", 0.0) == looks

@@ -76,7 +76,7 @@ def test_nothing_ever_overlaps(kind, seed):
     plants = np.array([is_plant(a) for a in props])
     fixed = flat_boxes(np.array([a.footprint for a in props]), 0.0)
     assert not len(overlaps(fixed[~plants], sum(~plants)))
-    for t in np.linspace(0.0, scene.seconds, 9):
+    for t in np.linspace(0.0, scene.seconds, 5):
         moment = scene.at(t, HEIGHT)
         ego = np.array([[0.0, 0, 0, 4.6, 1.9, 1, 0]])
         there = fixed - [*moment.position[:2], 0, 0, 0, 0, 0]

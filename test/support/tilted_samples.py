@@ -52,7 +52,7 @@ def upright_on(ground: Ground, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.column_stack([ahead, np.cross(up, ahead), up]), np.array([*at, c])
 
 
-@njit
+@njit(cache=True)
 def _ground_hits(ground, start, way, since, velocity, lift, max_range):
     """range, brightness, cosine and class (columns, rings) of the ground alone."""
     out = np.empty((*way.shape[:2], 4))

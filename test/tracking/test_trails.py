@@ -32,11 +32,10 @@ def test_trails_end_at_the_tracks_and_lie_where_they_were(seconds):
     assert len(trails(tracks, tracker.pose, stamp, seconds)) == len(tracks)
 
 
-@pytest.mark.parametrize("rate", [5, 10, 20, 30])
-@pytest.mark.parametrize("seconds", [1.0, 2.0, 5.0])
+@pytest.mark.parametrize("rate, seconds", [(5, 5.0), (10, 2.0), (20, 1.0), (30, 2.0)])
 def test_trails_last_as_long_at_any_rate(rate, seconds):
     tracker, trails = Tracker(), Trails()
-    for i in range(8 * rate):
+    for i in range(round(1.5 * seconds * rate)):
         stamp = START + i * 10**9 // rate + 1000 * (i % 3)  # 1 or 2 us late
         tracks = tracker(cars(car(2 * i / rate)), stamp, pose(0))
         way, = trails(tracks, tracker.pose, stamp, seconds)
