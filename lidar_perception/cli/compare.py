@@ -37,7 +37,8 @@ def _runs() -> list[Runs]:
 
 @click.command(cls=Command)
 @walk_options()
-@a_path("--weights", "One more network, PointPillars or PointNet; may be repeated.",
+@a_path("--weights", "One more detector: weights of PointPillars or PointNet, or a class of your "
+        "own, module:Class; may be repeated.",
         multiple=True)
 @out_file("--png", "Draw F1 and mean AP against time.")
 @intervals_option

@@ -10,6 +10,7 @@ from samples import scene
 
 from lidar_perception.detectors import custom
 from lidar_perception.detectors.open import default_params, kind_and_file, open_detector
+from lidar_perception.scoring.comparison.contenders import _name
 from lidar_perception.types import Detections, InputError, RunError
 
 MODULE = """
@@ -119,3 +120,9 @@ def test_function_becomes_a_detector():
     detector = custom.as_detector(lambda cloud: Detections.of([1, 0, 0, 1, 1, 1, 0], 3, 0.5))
     assert len(detector(scene(0)).detections) == 1
     assert custom.as_detector(detector) is detector
+
+
+def test_comparison_names_class_by_its_reference(module):
+    detector = open_detector(f"{module}:Fixed")
+    assert _name(detector, ["fused"]) == f"{module}:Fixed"
+    assert _name(detector, [f"{module}:Fixed"]) == f"{module}:Fixed #2"

@@ -22,6 +22,7 @@ from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.candidates import CandidateDetector
 from lidar_perception.detectors.checkpoint import NETWORKS, POINTNET
 from lidar_perception.detectors.contract import Detector
+from lidar_perception.detectors.custom import CustomDetector
 from lidar_perception.detectors.open import FUSED, LOAD, Configured, kind_and_file, open_detector
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.params import PointNetParams
@@ -56,7 +57,7 @@ class Opened:
     """A network's detector, with its name and weights."""
 
     name: str
-    detector: NetworkDetector
+    detector: NetworkDetector | CustomDetector
     source: Path
 
     def contender(self) -> Contender:
@@ -94,13 +95,13 @@ def contenders(weights: Sequence[Path] = (), device: str = "auto",
     def opened_as(path: str | Path) -> Configured:
         kind = kind_and_file(path)[0]
         return open_detector(path, device, sensor_height=sensor_height,
-                             range="auto" if kind == POINTNET else range,
+                             range="auto" if kind == POINTNET or kind not in LOAD else range,
                              settings=settings.get(kind, {}))
     files, absent = _own_files()
     opened: list[Opened] = []
     for path in [*files, *weights]:
         detector = opened_as(path)
-        if str(path) in LOAD or not isinstance(detector, NetworkDetector):
+        if str(path) in LOAD or not isinstance(detector, NetworkDetector | CustomDetector):
             raise InputError(f"{path} takes part anyway; give files of weights")
         opened.append(Opened(_name(detector, [FUSED, *(each.name for each in opened)]), detector,
                              path))
@@ -137,11 +138,14 @@ def _own_files() -> tuple[list[Path], dict[str, str]]:
     return files, absent
 
 
-def _name(detector: NetworkDetector, taken: Sequence[str]) -> str:
-    """What the detector is called, and a number where the name is taken."""
-    name = detector.group
-    if name in NETWORKS:
-        name = f"{NETWORKS[name][0]} {detector.config.title}".strip()
+def _name(detector: NetworkDetector | CustomDetector, taken: Sequence[str]) -> str:
+    """Return the name of a detector, with a number if the name is taken."""
+    if isinstance(detector, CustomDetector):
+        name = detector.name
+    elif detector.group in NETWORKS:
+        name = f"{NETWORKS[detector.group][0]} {detector.config.title}".strip()
+    else:
+        name = detector.group
     base, number = name, 2
     while name in taken:
         name, number = f"{base} #{number}", number + 1
