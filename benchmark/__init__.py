@@ -1,5 +1,5 @@
 """Our algorithms timed beside others in one run: python -m benchmark, or ./lidar benchmark."""
 
-from lidar_perception.runs.threads import wait_asleep
+from lidar_perception.runs.threads import use_passive_waiting
 
-wait_asleep()  # before __main__ loads torch, as OpenMP reads its environment once
+use_passive_waiting()  # before __main__ loads torch, as OpenMP reads its environment once

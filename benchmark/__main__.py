@@ -30,8 +30,8 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.threshold import segment_by_threshold
 from lidar_perception.runs.files import write_text
-from lidar_perception.runs.machine import cpu_name
-from lidar_perception.runs.memory import keep_freed
+from lidar_perception.runs.machine import read_cpu_name
+from lidar_perception.runs.memory import keep_freed_memory
 from lidar_perception.runs.terminal import errors
 from lidar_perception.scoring.centres.report import pedestrians
 from lidar_perception.types import InputError, LidarFrame
@@ -64,7 +64,7 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     Example:
       lidar benchmark --data /data/kitti/object --json benchmark.json
     """
-    keep_freed()
+    keep_freed_memory()
     recordings = [open_recording(path) for path in data]
     recording = next((each for each in recordings if {BOXES, CAMERA} <= each.has), recordings[0])
     recording.require(BOXES, "benchmark")
@@ -75,7 +75,8 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     labelled = [f for each in recordings if POINT_LABELS in each.has
                 for f in evenly_chosen(each.frames, count)]
     warm_up()
-    content: dict[str, Any] = {"machine": {"cpu": cpu_name(), "cores": os.cpu_count(), "python":
+    content: dict[str, Any] = {"machine": {"cpu": read_cpu_name(), "cores": os.cpu_count(),
+                                           "python":
                            platform.python_version(), "numpy": np.__version__},
                "peers": {p.package: p.version() for p in peers.ALL},
                "candidates": compare_candidates(frames, repeat)}

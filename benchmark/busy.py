@@ -17,13 +17,13 @@ import numpy as np
 
 from benchmark.rows import measured, row
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.runs.memory import keep_freed
-from lidar_perception.runs.terminal import track
-from lidar_perception.runs.threads import WAIT_ASLEEP
+from lidar_perception.runs.memory import keep_freed_memory
+from lidar_perception.runs.terminal import show_progress
+from lidar_perception.runs.threads import PASSIVE_WAITING
 from lidar_perception.types import LidarFrame
 
 BUSY = 2  # other processes
-WAYS = {"ours": WAIT_ASLEEP, "torch's": {}}
+WAYS = {"ours": PASSIVE_WAITING, "torch's": {}}
 
 
 def measure_busy(scans: list[LidarFrame], repeat: int) -> dict:
@@ -33,7 +33,7 @@ def measure_busy(scans: list[LidarFrame], repeat: int) -> dict:
     with ExitStack() as stack:
         workers = {way: stack.enter_context(_worker(environment, scans))
                    for way, environment in WAYS.items()}
-        for _ in track(range(repeat), title, repeat):
+        for _ in show_progress(range(repeat), title, repeat):
             for busy in (0, BUSY):
                 with _beside(busy):
                     for way, worker in workers.items():
@@ -50,7 +50,7 @@ def measure_busy(scans: list[LidarFrame], repeat: int) -> dict:
 @contextmanager
 def _worker(environment: dict[str, str], scans: list[LidarFrame]) -> Iterator[ProcessPoolExecutor]:
     """A process that has loaded torch in this environment."""
-    before = {name: os.environ.pop(name, None) for name in WAIT_ASLEEP}
+    before = {name: os.environ.pop(name, None) for name in PASSIVE_WAITING}
     os.environ.update(environment)
     try:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"),
@@ -69,7 +69,7 @@ _ready: dict = {}  # in a worker
 
 def _prepare(scans: list[LidarFrame]) -> None:
     import torch
-    keep_freed()
+    keep_freed_memory()
     torch.set_num_threads(len(os.sched_getaffinity(0)))  # as the nodes do
     _ready.update(detector=open_detector("pointpillars"), scans=scans)
 

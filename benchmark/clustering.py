@@ -17,7 +17,7 @@ from lidar_perception.clustering.dbscan import distance_aware_dbscan
 from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import DbscanParams, EuclideanParams
 from lidar_perception.ground.cloth import segment_by_cloth
-from lidar_perception.runs.terminal import track
+from lidar_perception.runs.terminal import show_progress
 
 PLAIN = "SciPy and NumPy"
 
@@ -56,7 +56,7 @@ def dbscan_times(chosen: list[int], clouds: list[np.ndarray], repeat: int,
     clock = Clock(repeat, calls(thin(clouds[0])))
     same: Counter[str] = Counter()
     differ: Counter[str] = Counter()
-    for xyz in track(clouds, title, len(clouds)):
+    for xyz in show_progress(clouds, title, len(clouds)):
         found = clock.time(calls(xyz))
         ours, core = found["ours"], core_points(xyz)
         for p in group:
@@ -91,7 +91,7 @@ def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> 
 
     title = f"Adaptive Euclidean, {threshold} threshold, whole scan"
     clock, same = Clock(repeat, calls(thin(clouds[0]))), 0
-    for xyz in track(clouds, title, len(clouds)):
+    for xyz in show_progress(clouds, title, len(clouds)):
         found = clock.time(calls(xyz))
         same += same_clusters(found[PLAIN], found["ours"], found["ours"] > 0)
     rows = [against(PLAIN, clock.medians(), 3, same)]
@@ -110,7 +110,7 @@ def measure_paper_c(scans: list[np.ndarray], repeat: int) -> dict:
 
     title = "Paper C: cloth and Euclidean, whole scan"
     clock = Clock(repeat, calls(thin(scans[0])))
-    for xyz in track(scans, title, len(scans)):
+    for xyz in show_progress(scans, title, len(scans)):
         clock.time(calls(xyz))
     ms = clock.medians()
     rows = [row(f"({t} threshold)", ours_ms=ms[t], value=ms[t], unit="ms", target=60)

@@ -23,8 +23,8 @@ from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS, netw
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
 from lidar_perception.detectors.pointpillars.network import make_network
 from lidar_perception.detectors.pointpillars.params import STEPS
-from lidar_perception.runs.machine import cpu_name
-from lidar_perception.runs.terminal import console, track
+from lidar_perception.runs.machine import read_cpu_name
+from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.types import LidarFrame
 
 PAPER_TO_V0 = {"v0": 1.0, "v1": 1.06, "v2": 1.86, "v3": 2.48, "v4": 3.54}  # paper B, RTX 4090
@@ -39,7 +39,7 @@ def measure_detection(scans: list[LidarFrame], repeat: int,
     are random: time depends on them only by what passes the thresholds, which are set to let
     CANDIDATES anchors through."""
     device = chosen_device()
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else read_cpu_name()
     content: dict[str, Any] = {"device": name, "threads": torch.get_num_threads(), "sizes": {}}
     for size in sizes:
         chosen = evenly_chosen(scans, FEW) if (size, device.type) == ("full", "cpu") else scans
@@ -54,7 +54,7 @@ def measure_detection(scans: list[LidarFrame], repeat: int,
 def _medians(detectors: dict[str, PointPillarsDetector], scans: list[LidarFrame], repeat: int,
              title: str) -> dict[str, dict]:
     ms = {version: np.zeros((len(scans), repeat, len(STEPS))) for version in detectors}
-    for i, scan in enumerate(track(scans, title, len(scans))):
+    for i, scan in enumerate(show_progress(scans, title, len(scans))):
         for j in range(repeat):
             for version, detector in detectors.items():
                 said = detector(scan).ms
@@ -137,7 +137,7 @@ def measure_engines(scans: list[LidarFrame], repeat: int,
                 for name, engine in (("torch", "torch"), ("ours", "sparse"))}
             name, same = f"{weights} {range_}, engine torch", 0
             clock = Clock(repeat, {}, process_time)
-            for scan in track(scans, name, len(scans)):
+            for scan in show_progress(scans, name, len(scans)):
                 found = clock.time({each: partial(detector, scan)
                                     for each, detector in engines.items()})
                 same += _same(found["torch"], found["ours"])

@@ -31,7 +31,7 @@ from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.files import write_text
-from lidar_perception.runs.terminal import console, track
+from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
 from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
 from lidar_perception.scoring.tracking.pairs import pairs_of, tracked_labels, without_ignored
@@ -195,7 +195,7 @@ def main(first: int, count: int, seconds: float, people: float, cache: Path,
     """Our tracker beside a plain AB3DMOT, and single frames beside tracks, on simulated drives."""
     frames = round(seconds * HDL64E.rate)
     drives = [cached(cache, street, frames, people) for street in
-              track(range(first, first + count), "detecting", count)]
+              show_progress(range(first, first + count), "detecting", count)]
     content = {"drives": count, "seconds": seconds, "people": people, "first": first, "detectors": {
         name: measured(drives, name, TrackingParams()) for name in DETECTORS}}
     print_drives(content)

@@ -11,7 +11,7 @@ from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.frame import Recording
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.runs.terminal import console, track
+from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.wire.topics import POINTS
 
 
@@ -20,7 +20,7 @@ def measure_graph(recording: Recording, single: bool) -> dict:
     from lidar_perception.nodes.replay.graph_replay import replay
     with tempfile.TemporaryDirectory() as folder:
         drive, out = Path(folder) / "drive", Path(folder)
-        write_bag(drive, track(recording, "writing a bag", len(recording)))
+        write_bag(drive, show_progress(recording, "writing a bag", len(recording)))
         with Bag(drive) as bag:
             clouds = bag.counts[POINTS]
         content = replay(drive, clouds, out, PAPER, single=single)

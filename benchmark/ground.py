@@ -21,7 +21,7 @@ from lidar_perception.ground.threshold import (
     height_above_plane,
     segment_by_threshold,
 )
-from lidar_perception.runs.terminal import track
+from lidar_perception.runs.terminal import show_progress
 from lidar_perception.scoring.points.segmentation import PROTOCOLS, GroundReport, ground_by_protocol
 from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
 
@@ -55,7 +55,7 @@ def _timed(title: str, clouds: list[np.ndarray], repeat: int,
                 "ours": partial(segment_by_threshold, xyz)}
 
     clock = Clock(repeat, calls(thin(clouds[0])))
-    found = [clock.time(calls(xyz)) for xyz in track(clouds, title, len(clouds))]
+    found = [clock.time(calls(xyz)) for xyz in show_progress(clouds, title, len(clouds))]
     return clock.medians(), {p.name: [f[p.name] for f in found] for p in here}
 
 
@@ -122,7 +122,7 @@ def measure_patchwork(frames: list[LidarFrame], repeat: int) -> dict:
     same = 0
     with silence_stdout():
         clock = Clock(repeat, calls(frames[0], _with_intensity(frames[0])))
-        for frame in track(frames, title, len(frames)):
+        for frame in show_progress(frames, title, len(frames)):
             found = clock.time(calls(frame, _with_intensity(frame)))
             same += np.array_equal(_mask(found[name], len(frame)), found["ours"])
     ms = clock.medians()
@@ -155,7 +155,7 @@ def measure_cloth(scans: list[np.ndarray], repeat: int) -> dict:
 
     with silence_stdout():
         clock = Clock(min(repeat, SLOW_REPEAT), calls(*_both(thin(scans[0]))))
-        for xyz in track(scans, title, len(scans)):
+        for xyz in show_progress(scans, title, len(scans)):
             clock.time(calls(*_both(xyz)))
     return measured(title, len(scans), points, [against(name, clock.medians(), 6)])
 
@@ -180,7 +180,7 @@ def measure_labelled(frames: list[Frame], repeat: int) -> dict:
 
     with silence_stdout():
         clock = None
-        for item in track(frames, "ground of labelled scans", len(frames)):
+        for item in show_progress(frames, "ground of labelled scans", len(frames)):
             frame, semantic = item.load(), item.point_truth().classes
             clock = clock or Clock(min(repeat, SLOW_REPEAT), calls(frame))
             for name, found in clock.time(calls(frame)).items():

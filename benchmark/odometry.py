@@ -24,7 +24,7 @@ from rich.table import Table
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.robot.poses import invert_pose
-from lidar_perception.runs.terminal import console, track
+from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.simulation.drive import scans
 from lidar_perception.tracking.ego import Odometry
 from lidar_perception.types import LidarFrame
@@ -104,7 +104,7 @@ def _off(poses: np.ndarray, true: np.ndarray, step: int) -> np.ndarray:
 def main(data: Path | None, streets: int, frames: int) -> None:
     """What KISS-ICP costs beside a detector, and how far off its poses are."""
     given = recorded(data, frames) if data else simulated(streets, frames)
-    content = measured(track(given, "driving", frames * (1 if data else streets)),
+    content = measured(show_progress(given, "driving", frames * (1 if data else streets)),
                        DETECTORS if data else ())
     table = Table(title="A scan: CPU ms; metres off over 1 frame, over 10")
     for name in ("", "CPU ms", "1", "10"):

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmark.rows import measured, row
 from benchmark.timing import Clock
-from lidar_perception.runs.terminal import track
+from lidar_perception.runs.terminal import show_progress
 from lidar_perception.simulation.raycast import cast
 from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.scene import Scene, make_scene
@@ -26,7 +26,7 @@ def measure_simulation(streets: int, repeat: int) -> dict:
     first = _calls(*scenes[0])
     clock = Clock(min(repeat, 3), first)
     points, solids = [], []
-    for seed, scene in track(scenes, title, len(scenes)):
+    for seed, scene in show_progress(scenes, title, len(scenes)):
         calls = _calls(seed, scene)
         clock.time(calls)
         points.append(len(calls["returns"]().xyz))

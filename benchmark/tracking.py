@@ -14,7 +14,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Recording
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.params import MIN_SCORE, ScoreParams
-from lidar_perception.runs.terminal import console, track
+from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
 from lidar_perception.tracking.drive_tracker import ego_of
@@ -49,7 +49,7 @@ def measure_recording(recording: Recording) -> dict:
                              sensor_height=recording.frames[0].sensor_height)
     drives: dict[str, list[Seen]] = {}
     source = ego_of(recording)
-    for frame in track(recording, "detecting", len(recording)):
+    for frame in show_progress(recording, "detecting", len(recording)):
         truth, frame = frame.truth(), frame.with_cached_scan()
         if truth is not None and all("track_id" in extra for extra in truth.extras):
             if frame.sequence not in drives:

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from lidar_perception.runs.resuming import claim, differences, locked
+from lidar_perception.runs.resuming import find_differences, lock_file, lock_folder
 from lidar_perception.types import InputError
 
 NAME, VERSION = "journal.jsonl", 1
@@ -49,7 +49,7 @@ class Journal:
         except OSError as error:
             raise InputError(f"cannot open {self.path}: {error.strerror}") from None
         try:
-            if why := claim(self._file, self.path):  # on NFS the lock of its folder is none
+            if why := lock_file(self._file, self.path):  # on NFS the lock of its folder is none
                 self.message = (f"{self.path} cannot be locked ({why}): let no second process "
                                 "label this drive")
             self._size = self._read()
@@ -133,7 +133,7 @@ class Journal:
             raise InputError(f"{self.path} was made {then} poses of the sensor, and the drive is "
                              f"{now} them now, by which boxes between those set by hand would be "
                              "others; give the drive as it was, or another --out")
-        if different := differences({k: found.get(k) for k in asked}, asked):
+        if different := find_differences({k: found.get(k) for k in asked}, asked):
             raise InputError(f"{self.path} is the journal of another drive: "
                              f"{'; '.join(different)}; give another --out")
 
@@ -151,7 +151,7 @@ def _sync_folder(folder: Path) -> None:
 def opened(folder: Path, head: Mapping[str, Any]) -> Iterator[Journal]:
     """The journal of a folder, which is made if need be. InputError while another process has
     it."""
-    with locked(folder):
+    with lock_folder(folder):
         journal = Journal(folder, head)
         try:
             yield journal

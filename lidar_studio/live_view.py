@@ -16,7 +16,7 @@ from lidar_perception.nodes.runtime import CLOUD, MARKERS, decoded
 from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, TF_QOS, has_tf
 from lidar_perception.nodes.watch import Outside
 from lidar_perception.params import ReceptionParams
-from lidar_perception.runs.files import short
+from lidar_perception.runs.files import shorten_error
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import TF, TF_STATIC
 from lidar_perception.wire.transforms import TF_MESSAGE, add_transforms
@@ -56,7 +56,7 @@ class LiveView(Outside):
             self.until(stop.is_set, math.inf, self._each)
         except Exception as error:  # of a thread nobody waits for
             self.live.lines = [f"nothing is received any more: {type(error).__name__}: "
-                               f"{short(error)}; start again"]
+                               f"{shorten_error(error)}; start again"]
             self.live.tick()
             raise
 
@@ -109,7 +109,7 @@ class LiveView(Outside):
                 take(decoded(data, kind))
                 self.broken.pop(topic, None)
             except Exception as error:  # of whatever anybody sends: it is said, and the next taken
-                self.broken[topic] = f"{topic}: {short(error)}"
+                self.broken[topic] = f"{topic}: {shorten_error(error)}"
         return taking
 
     def _boxes(self, topic: str, kind: str) -> Callable[[Any], None]:

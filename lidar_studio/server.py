@@ -16,7 +16,7 @@ from typing import Any
 
 from aiohttp import WSMsgType, web
 
-from lidar_perception.runs.files import short
+from lidar_perception.runs.files import shorten_error
 from lidar_perception.types import InputError
 from lidar_studio.actions import track_of
 from lidar_studio.served import Served
@@ -74,7 +74,7 @@ class Server:
             response = _error(error.status, error.reason)
         except Exception as error:  # ours; the page is told, and the labels are as the journal has
             LOG.exception("%s %s", request.method, request.path)  # them
-            response = _error(500, f"this failed: {type(error).__name__}: {short(error)}")
+            response = _error(500, f"this failed: {type(error).__name__}: {shorten_error(error)}")
         if not response.prepared:
             response.headers.update(HEADERS)
         return response
@@ -236,7 +236,7 @@ async def _object(request: web.Request) -> Mapping[str, Any]:
     try:
         found = await request.json()
     except (ValueError, RecursionError) as error:
-        raise InputError(f"the request is no JSON: {short(error)}") from None
+        raise InputError(f"the request is no JSON: {shorten_error(error)}") from None
     if not isinstance(found, dict):
         raise InputError("the request is no JSON object")
     return found

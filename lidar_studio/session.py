@@ -15,7 +15,7 @@ import numpy as np
 
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.labels.exchange import export_labels, import_labels, recognised
-from lidar_perception.runs.files import short
+from lidar_perception.runs.files import shorten_error
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 from lidar_studio import survey_cache
 from lidar_studio.actions import (
@@ -127,7 +127,7 @@ class Session:
                 work()
             except Exception as error:  # of a thread nobody waits for: the page is told
                 self.tell({"error": str(error) if isinstance(error, InputError) else
-                           f"no proposals: {type(error).__name__}: {short(error)}"})
+                           f"no proposals: {type(error).__name__}: {shorten_error(error)}"})
             finally:
                 self.busy = None
                 with self._lock:

@@ -21,7 +21,7 @@ from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.groups import group_points
-from lidar_perception.runs.processes import in_processes
+from lidar_perception.runs.processes import run_in_processes
 from lidar_perception.tracking.ego import Odometry, recorded_source
 from lidar_perception.types import Detections
 from lidar_studio.drive import Drive, one_drive, settings
@@ -109,8 +109,8 @@ def surveyed(drive: Drive, choice: DetectorChoice | None, here: bool = False,
         yield from map(_here(drive, choice, first), frames)
         return
     sequence = drive.frames[0].sequence
-    yield from in_processes(partial(_elsewhere, reopen, choice, sequence, first), frames, 1,
-                            "looked for proposals", apart=True)
+    yield from run_in_processes(partial(_elsewhere, reopen, choice, sequence, first), frames, 1,
+                                "looked for proposals", apart=True)
 
 
 def _by_scans(drive: Drive) -> bool:

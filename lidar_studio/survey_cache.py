@@ -16,8 +16,8 @@ import numpy as np
 
 from lidar_perception import __version__
 from lidar_perception.detectors.open import DetectorChoice
-from lidar_perception.runs.files import short, write_bytes
-from lidar_perception.runs.resuming import differences
+from lidar_perception.runs.files import shorten_error, write_bytes
+from lidar_perception.runs.resuming import find_differences
 from lidar_perception.types import Detections, InputError
 from lidar_studio.drive import Drive
 from lidar_studio.survey import Look
@@ -91,13 +91,13 @@ def read(folder: Path, key: str) -> tuple[list[Look], str]:
                 found = str(file["key"])
                 looks += _looks(file) if found == key else []
             if found != key:
-                other = "; ".join(differences(json.loads(found), json.loads(key)))
+                other = "; ".join(find_differences(json.loads(found), json.loads(key)))
                 return [], (f"{folder} is of something else ({other}); the drive is looked at "
                             "again")
         except (OSError, ValueError, TypeError, KeyError, AttributeError, EOFError, BadZipFile,
                 zlib.error) as error:
-            return looks, (f"{path} is damaged ({short(error)}); the drive is looked at again from "
-                           f"frame {first} on")
+            return looks, (f"{path} is damaged ({shorten_error(error)}); the drive is looked at "
+                           f"again from frame {first} on")
         first += PIECE
     return looks, ""
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from rich.text import Text
 
 from lidar_perception.runs.terminal import errors
-from lidar_perception.runs.threads import one_thread_each, wait_asleep
+from lidar_perception.runs.threads import default_to_one_thread, use_passive_waiting
 
 ROOT = Path(__file__).resolve().parents[1]
 MAX_WORKERS = 4  # each loads torch and compiles
@@ -48,7 +48,7 @@ for frame in simulated_scans(1, 1):
 
 def main(arguments: list[str]) -> int:
     """Run everything, or pytest alone with the arguments; return the exit code."""
-    wait_asleep()
+    use_passive_waiting()
     if arguments:
         return subprocess.run([sys.executable, "-m", "pytest", *arguments], cwd=ROOT).returncode
     with tempfile.TemporaryDirectory() as folder:
@@ -77,7 +77,7 @@ class BackgroundCommand:
 def run_everything(folder: Path) -> list[str]:
     """Run all checks and tests and return the names of those that failed. folder: for the files of
     the coverage measurement."""
-    one_thread_each()  # as many processes as cores
+    default_to_one_thread()  # as many processes as cores
     environment = {**os.environ, "COVERAGE_FILE": str(folder / "coverage")}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # compiled once, not in each process
     if sys.version_info >= (3, 12):

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from lidar_perception.runs.memory import keep_freed
+from lidar_perception.runs.memory import keep_freed_memory
 
 pytest_plugins = ["lidar_perception.testing"]
 os.environ.pop("COLUMNS", None)  # pytest-xdist sets 80 for its workers; some tests set their own
-keep_freed()  # as commands and nodes do
+keep_freed_memory()  # as commands and nodes do
 
 # No test measures time. --hypothesis-profile deep looks where the everyday run seldom comes.
 settings.register_profile("everyday", deadline=None, max_examples=40)

@@ -1,4 +1,4 @@
-"""The first compilation on a machine is reported, and waited for by other processes."""
+"""The first compilation on a machine is reported, and other processes wait for it."""
 
 from __future__ import annotations
 
@@ -13,68 +13,68 @@ import pytest
 from numba import njit
 
 from lidar_perception.runs import compiling
-from lidar_perception.runs.compiling import compilation_reported, one_at_a_time
+from lidar_perception.runs.compiling import lock_compilation, report_compilation
 
 
 @pytest.fixture
-def patience(monkeypatch):
-    """Every compilation and every wait is long."""
-    monkeypatch.setattr(compiling, "PATIENCE", 0.0)
-    monkeypatch.setattr(compiling, "TICK", 0.001)
+def report_all(monkeypatch):
+    """Report every compilation and every wait, however short."""
+    monkeypatch.setattr(compiling, "REPORT_AFTER_S", 0.0)
+    monkeypatch.setattr(compiling, "POLL_INTERVAL_S", 0.001)
 
 
-def test_compilation_is_reported_by_the_outermost_block(patience, capsys):
+def test_compilation_is_reported_by_the_outermost_block(report_all, capsys):
     lines = []
-    with compilation_reported(lines.append), compilation_reported(lambda _: pytest.fail("twice")):
+    with report_compilation(lines.append), report_compilation(lambda _: pytest.fail("twice")):
         assert njit(lambda x: x + 1)(1) == 2
     assert lines[0] == compiling.COMPILING and lines[-1].startswith("compiled 1 functions in ")
     assert lines.count(compiling.COMPILING) == 1
-    with compilation_reported():  # again, and on standard error
+    with report_compilation():  # on standard error by default
         njit(lambda x: x + 2)(1)
     captured = capsys.readouterr()
     assert compiling.COMPILING in captured.err and captured.out == ""
 
 
-def test_what_is_compiled_already_is_not_reported(monkeypatch):
+def test_calls_of_compiled_code_are_not_reported(monkeypatch):
     function = njit(lambda x: x + 1)
     function(1)
-    monkeypatch.setattr(compiling, "PATIENCE", 1e-9)
-    monkeypatch.setattr(compiling, "TICK", 0.001)
-    with compilation_reported(pytest.fail):
+    monkeypatch.setattr(compiling, "REPORT_AFTER_S", 1e-9)
+    monkeypatch.setattr(compiling, "POLL_INTERVAL_S", 0.001)
+    with report_compilation(pytest.fail):
         assert function(1) == 2
-        threading.Event().wait(0.01)  # the reporter has looked
+        threading.Event().wait(0.01)  # lets the reporter poll
 
 
-def test_wait_for_another_process_is_reported(patience, tmp_path, monkeypatch):
+def test_wait_for_another_process_is_reported(report_all, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     lines = []
     with open(tmp_path / f"lidar_perception-{os.getuid()}.lock", "w") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
 
-        def say(line):
+        def report(line):
             lines.append(line)
-            other.close()  # it is done
+            other.close()  # releases the lock
 
-        with one_at_a_time(say):
+        with lock_compilation(report):
             pass
     assert lines[0] == compiling.WAITING and lines[1].startswith("waited ")
-    with one_at_a_time(pytest.fail):  # it is free
+    with lock_compilation(pytest.fail):  # the lock is free
         pass
 
 
 @pytest.mark.parametrize("cached", [True, False])
 def test_empty_cache_is_reported_before_anything_is_compiled(cached, monkeypatch):
-    monkeypatch.setattr(compiling, "_cached", lambda: cached)
+    monkeypatch.setattr(compiling, "_is_cached", lambda: cached)
     lines = []
-    with compilation_reported(lines.append), compilation_reported(all_of_it=True):
+    with report_compilation(lines.append), report_compilation(whole_detector=True):
         assert lines == [compiling.COMPILING] * (not cached)
 
 
 def test_cache_is_found_where_numba_keeps_it(tmp_path):
     """In a process of its own, as the folder is chosen when a function is compiled."""
-    code = ("from lidar_perception.runs.compiling import _cached; print(_cached());"
+    code = ("from lidar_perception.runs.compiling import _is_cached; print(_is_cached());"
             "import numpy, lidar_perception.geometry as g;"
-            "g.stable_order(numpy.zeros(1, int), 1, numpy.zeros(1, int)); print(_cached())")
+            "g.counting_sort(numpy.zeros(1, int), 1, numpy.zeros(1, int)); print(_is_cached())")
     done = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True,
                           env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, check=True)
     assert done.stdout.split() == ["False", "True"]

@@ -1,5 +1,4 @@
-"""Processes that work for another one end with it, and give back what they hold; freed memory stays
-with those that work on clouds."""
+"""Worker processes end with their parent and release resources; freed memory is kept."""
 
 from __future__ import annotations
 
@@ -19,82 +18,81 @@ from threadpoolctl import threadpool_info
 
 from lidar_perception.runs import processes
 
-HELD = []
+SEMAPHORES = []
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def holding() -> Callable[[int], bytes]:
-    """Work that holds many semaphores of the system and makes more than a pipe takes."""
-    HELD.extend(multiprocessing.get_context("forkserver").Semaphore() for _ in range(40))
+def hold_semaphores() -> Callable[[int], bytes]:
+    """Hold many semaphores; each result is larger than the buffer of a pipe."""
+    SEMAPHORES.extend(multiprocessing.get_context("forkserver").Semaphore() for _ in range(40))
     return lambda item: bytes(300_000)
 
 
-def stubborn() -> Callable[[int], int | None]:
-    """Work that says who does it, and then takes long, whatever it is told."""
+def ignore_sigterm() -> Callable[[int], int | None]:
+    """Return the process id for two items, then sleep and ignore SIGTERM."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     return lambda item: os.getpid() if item < 2 else sleep(600)
 
 
-def counting() -> Callable[[int], int]:
-    """Work that says with how many threads matrices are multiplied."""
+def count_threads() -> Callable[[int], int]:
+    """Return the number of threads that multiply matrices."""
     np.ones((2, 2)) @ np.ones((2, 2))
     return lambda item: max(library["num_threads"] for library in threadpool_info())
 
 
-def result_of(script: str, **environment: str) -> subprocess.CompletedProcess:
+def run_script(script: str, **environment: str) -> subprocess.CompletedProcess:
     path = os.pathsep.join(map(str, (ROOT, ROOT / "test", ROOT / "test/support")))
     return subprocess.run([sys.executable, "-c", script], text=True, capture_output=True,
                           env={**os.environ, "PYTHONPATH": path, **environment}, check=False)
 
 
 @pytest.mark.skipif(os.cpu_count() == 1, reason="has one core")
-def test_processes_that_share_the_cores_compute_with_one_thread_each():
-    """Threads of linear algebra wait actively, for each other and for those of other processes."""
-    script = ("from lidar_perception.runs.processes import in_order, in_processes\n"
-              "from test_processes import counting\n"
-              "print(*in_processes(counting, [0, 1], 2, 'worked'),\n"
-              "      *in_order(counting, [0], 1, 1, 'worked'),\n"
-              "      *in_processes(counting, [0], 1, 'worked', apart=True))\n")
-    assert result_of(script, OPENBLAS_NUM_THREADS="2").stdout.split() == ["1", "1", "1", "2"]
+def test_processes_that_share_cores_use_one_thread_each():
+    """Threads of linear algebra libraries spin while they wait."""
+    script = ("from lidar_perception.runs.processes import run_in_order, run_in_processes\n"
+              "from test_processes import count_threads\n"
+              "print(*run_in_processes(count_threads, [0, 1], 2, 'worked'),\n"
+              "      *run_in_order(count_threads, [0], 1, 1, 'worked'),\n"
+              "      *run_in_processes(count_threads, [0], 1, 'worked', apart=True))\n")
+    assert run_script(script, OPENBLAS_NUM_THREADS="2").stdout.split() == ["1", "1", "1", "2"]
 
 
-def test_processes_that_are_ended_give_back_what_they_hold():
+def test_ended_processes_release_system_resources():
     script = ("import itertools\n"
-              "from lidar_perception.runs.processes import in_order\n"
-              "from test_processes import holding\n"
+              "from lidar_perception.runs.processes import run_in_order\n"
+              "from test_processes import hold_semaphores\n"
               "for _ in range(8):\n"
-              "    made = in_order(holding, itertools.count(), 2, 4, 'worked')\n"
-              "    assert [len(next(made)) for _ in range(3)] == [300_000] * 3\n"
-              "    made.close()\n")
-    run = result_of(script)
+              "    results = run_in_order(hold_semaphores, itertools.count(), 2, 4, 'worked')\n"
+              "    assert [len(next(results)) for _ in range(3)] == [300_000] * 3\n"
+              "    results.close()\n")
+    run = run_script(script)
     assert (run.returncode, run.stderr) == (0, "")
 
 
-def test_a_process_that_does_not_end_when_it_is_asked_to_is_killed(monkeypatch):
-    """Else who waits for its end would wait for ever."""
-    monkeypatch.setattr(processes, "PATIENCE", 0.2)
-    made = processes.in_order(stubborn, itertools.count(), 2, 2, "worked")
-    stuck = [next(made), next(made)]
-    made.close()
+def test_a_process_that_ignores_sigterm_is_killed(monkeypatch):
+    monkeypatch.setattr(processes, "EXIT_TIMEOUT_S", 0.2)
+    results = processes.run_in_order(ignore_sigterm, itertools.count(), 2, 2, "worked")
+    stuck = [next(results), next(results)]
+    results.close()
     for process in stuck:
         with pytest.raises(ProcessLookupError):
             os.kill(process, 0)
 
 
 @pytest.mark.skipif(os.confstr("CS_GNU_LIBC_VERSION") is None, reason="not glibc")
-@pytest.mark.parametrize("own", [{}, {"MALLOC_TRIM_THRESHOLD_": "131072"}],
-                         ids=["ours", "the user's"])
-def test_memory_is_used_again_where_the_user_does_not_say_otherwise(own):
-    """Counted in pages that the system gives out."""
+@pytest.mark.parametrize("user", [{}, {"MALLOC_TRIM_THRESHOLD_": "131072"}],
+                         ids=["default", "set by the user"])
+def test_freed_memory_is_reused_unless_the_user_sets_malloc(user):
+    """Count the page faults of repeated allocations."""
     script = ("import resource\n"
               "import numpy as np\n"
-              "from lidar_perception.runs.memory import keep_freed\n"
-              "keep_freed()\n"
+              "from lidar_perception.runs.memory import keep_freed_memory\n"
+              "keep_freed_memory()\n"
               "for _ in range(2):\n"
               "    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
               "    for _ in range(5):\n"
               "        np.ones(8_000_000)\n"
               "print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)\n")
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("MALLOC", "GLIBC"))}
-    pages = int(subprocess.check_output([sys.executable, "-c", script], env=environment | own))
-    assert (pages > 100) == bool(own)
+    pages = int(subprocess.check_output([sys.executable, "-c", script], env=environment | user))
+    assert (pages > 100) == bool(user)

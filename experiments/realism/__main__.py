@@ -13,7 +13,7 @@ from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import data_argument, opened, out_file, write_json
 from lidar_perception.data.frame import BOXES
-from lidar_perception.runs.terminal import console, track
+from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.simulation.scene import MOST_PEOPLE, Scenes
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
@@ -46,9 +46,9 @@ def main(data: Path, sensor: str, mount_height: float, frames: int, seed: int, p
     recording.require(BOXES, "realism")
     chosen = evenly(recording)
     warm_up()
-    measured = measured_scans(track(chosen, "measuring real scans", len(chosen)), PAPER)
+    measured = measured_scans(show_progress(chosen, "measuring real scans", len(chosen)), PAPER)
     made = simulated_scans(seed, frames, model, streets_of=1, scenes=Scenes(None, people, "street"))
-    simulated = measured_scans(track(made, "measuring simulated scans", frames), PAPER)
+    simulated = measured_scans(show_progress(made, "measuring simulated scans", frames), PAPER)
     content = {"data": str(data), "seed": seed, **side_by_side(measured, simulated)}
     print_realism(content, console)
     write_json(json, content)

@@ -12,7 +12,7 @@ import numpy as np
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.silhouette import draw_silhouettes, to_pixels
 from lidar_perception.geometry import points_in_box
-from lidar_perception.runs.files import read_text, short, write_text
+from lidar_perception.runs.files import read_text, shorten_error, write_text
 from lidar_perception.types import MAX_RANGE, InputError
 
 MIN_POINTS = 10  # fewer points have no shape to compare with; as DBSCAN's min_samples
@@ -135,7 +135,7 @@ def load_seed(path: str | Path = "") -> Seed:
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{source} is not a template ({short(error)}); make one with "
+        raise InputError(f"{source} is not a template ({shorten_error(error)}); make one with "
                          "'lidar-perception seed'") from None
     if (xyz.ndim != 2 or xyz.shape[1] != 3 or len(xyz) < MIN_POINTS or not 0 < height <= MAX_RANGE
             or not (np.abs(xyz) <= MAX_RANGE).all() or not abs(floor) <= MAX_RANGE):

@@ -12,12 +12,12 @@ from lidar_perception.candidates.seeds import seed_from_points
 from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import EuclideanParams
 from lidar_perception.param_fields import with_values
-from lidar_perception.runs.compiling import compilation_reported
+from lidar_perception.runs.compiling import report_compilation
 from lidar_perception.types import LidarFrame
 from lidar_perception.wire.params import ViewParams
 
 
-@compilation_reported(all_of_it=True)
+@report_compilation(whole_detector=True)
 def warm_up() -> None:
     """Run every stage and method once on synthetic points to trigger JIT compilation."""
     rng = np.random.default_rng(0)

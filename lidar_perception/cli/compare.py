@@ -62,7 +62,7 @@ def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, range: str,
       lidar-perception compare training_data --weights v4.safetensors --limit 100
     """
     from lidar_perception.data.frame import BOXES
-    from lidar_perception.runs.machine import cpu_name
+    from lidar_perception.runs.machine import read_cpu_name
     from lidar_perception.scoring.comparison.contenders import contenders, opened_in_a_process
     from lidar_perception.scoring.comparison.outcomes import ComparisonReport, by_contenders
     from lidar_perception.scoring.comparison.report import draw_comparison, print_comparison
@@ -82,7 +82,7 @@ def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, range: str,
         raise no_labels(recording, report.skipped)
     centres = report.first.pedestrians.compute()
     content = {
-        "source": str(walk.data), "machine": cpu_name(), "device": device,
+        "source": str(walk.data), "machine": read_cpu_name(), "device": device,
         "python": platform.python_version(), **report.compute(),
         "pedestrians": {key: centres[key] for key in ("frames", "ground_truth")},
         "missing": [vars(each) for each in missing], "paper_f1": CENTRE_F1}

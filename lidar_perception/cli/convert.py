@@ -17,7 +17,7 @@ from lidar_perception.cli.data import a_path, limit_option, opened, split_option
 from lidar_perception.labels.datasets import LAYOUTS
 from lidar_perception.labels.exchange import FORMATS, READERS
 from lidar_perception.labels.names import ALIASES
-from lidar_perception.runs.terminal import console, track
+from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.types import InputError
 
 MCAP = "mcap"
@@ -154,7 +154,7 @@ def _bag(source: Path, recording: Any, seen: Callable[[Any], Any], out: Path, im
     from lidar_perception.data.to_bag import write_bag
     count = min(len(recording), limit or len(recording))
     skipped: list[str] = []
-    frames = track(map(seen, islice(recording, count)), f"converting {source}", count)
+    frames = show_progress(map(seen, islice(recording, count)), f"converting {source}", count)
     written = write_bag(out, frames, images=images, force=force, skipped=skipped)
     console.print(f"{out}: {written} scans of {count}")
     for line in skipped:
@@ -179,7 +179,7 @@ def _dataset(source: Path, recording: Any, seen: Callable[[Any], Any], format: s
         export_labels(labels.first(count), format, out, recording.frames[:count], force)
         console.print(f"{out}: {count} scans")
         return
-    frames = track(map(seen, islice(recording, count)), f"converting {source}", count)
+    frames = show_progress(map(seen, islice(recording, count)), f"converting {source}", count)
     summary = write_dataset(format, frames, out, labels, force)
     drives = f"{summary.drives} drive{'' if summary.drives == 1 else 's'}"
     console.print(f"{out}: {summary.frames} scans of {drives}, {summary.boxes} boxes")

@@ -12,8 +12,8 @@ from typing import Any
 
 import click
 
-from lidar_perception.runs.files import check_folder, write_text
-from lidar_perception.runs.machine import cores
+from lidar_perception.runs.files import check_writable_folder, write_text
+from lidar_perception.runs.machine import count_cores
 from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
 
@@ -51,7 +51,7 @@ class OutFolder(click.Path):
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
-        check_folder(path)
+        check_writable_folder(path)
         return path
 
 
@@ -63,7 +63,7 @@ def out_folder(what: str, name: str = "--out", **more: Any) -> Callable:
 def jobs_for_all_cores(what: str, least: int = 0) -> Callable:
     """--jobs, of processes that do what is said and none of which changes the result."""
     return click.option("--jobs", type=click.IntRange(least),
-                        default=lambda: min(cores(), MOST_JOBS), show_default=f"one for each "
+                        default=lambda: min(count_cores(), MOST_JOBS), show_default=f"one for each "
                         f"core, {MOST_JOBS} at most", help=f"{what} The result is the same.")
 
 

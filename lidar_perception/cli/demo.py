@@ -41,7 +41,7 @@ from lidar_perception.groups import renumber_ids
 from lidar_perception.nodes import require_rclpy
 from lidar_perception.nodes.graph import ALONE, FINAL, cloud_topic, result_topics
 from lidar_perception.runs.files import write_text
-from lidar_perception.runs.terminal import console, errors, track
+from lidar_perception.runs.terminal import console, errors, show_progress
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.scoring.recorded import Answered, answered
@@ -179,12 +179,13 @@ def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
             recording.frames.points == POINTS and recording.frames.poses.needs_no_tf):
         return recording.path
     if recording is not None:
-        found = track(recording, f"converting {recording.path}", len(recording))
+        found = show_progress(recording, f"converting {recording.path}", len(recording))
     else:
         from lidar_perception.simulation.scene import CROWDED
         from lidar_perception.simulation.to_bag import simulated_scans
-        found = track(simulated_scans(drive_seed, frames, scenes=CROWDED), "simulating a drive",
-                      frames)
+        found = show_progress(simulated_scans(drive_seed, frames, scenes=CROWDED),
+                              "simulating a drive",
+                              frames)
     write_bag(path, found, force=True)
     return path
 

@@ -49,9 +49,9 @@ class LazyGroup(Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """A command that is stopped ends with 130, as everywhere; click would say 1, an error."""
-        from lidar_perception.runs.terminal import input_warnings_shown
+        from lidar_perception.runs.terminal import show_input_warnings
         try:
-            with input_warnings_shown():
+            with show_input_warnings():
                 return super().invoke(ctx)
         except KeyboardInterrupt:
             ctx.exit(130)
@@ -82,14 +82,14 @@ def cli() -> None:
 
 
 def main() -> None:
-    from lidar_perception.runs.files import refusals_named
-    from lidar_perception.runs.memory import keep_freed
-    from lidar_perception.runs.threads import wait_asleep
+    from lidar_perception.runs.files import convert_os_errors
+    from lidar_perception.runs.memory import keep_freed_memory
+    from lidar_perception.runs.threads import use_passive_waiting
     from lidar_perception.types import InputError
-    wait_asleep()
-    keep_freed()
+    use_passive_waiting()
+    keep_freed_memory()
     try:
-        with refusals_named():
+        with convert_os_errors():
             cli(prog_name="lidar-perception")
     except InputError as error:
         click.echo(f"Error: {error}", err=True)

@@ -13,7 +13,7 @@ import yaml
 from lidar_perception.candidates.configurations import CONFIGURATIONS
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.known import misspelt
-from lidar_perception.runs.files import read_text, short
+from lidar_perception.runs.files import read_text, shorten_error
 from lidar_perception.types import InputError, did_you_mean, valid_names
 
 MAX_BYTES, MAX_NAMES = 10**6, 10_000  # of a parameter file; aliases in YAML make many of few bytes
@@ -78,7 +78,7 @@ def _loaded(path: Path) -> dict[Any, Any]:
     try:
         content = yaml.safe_load(read_text(path, MAX_BYTES))
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
-        raise InputError(f"cannot read the parameter file {path}: {short(error)}") from None
+        raise InputError(f"cannot read the parameter file {path}: {shorten_error(error)}") from None
     if not isinstance(content, dict | None):
         raise InputError(f"{path} is no parameter file; see config/ for the form")
     return content or {}

@@ -24,7 +24,7 @@ from lidar_perception.cli.data import (
     split_option,
 )
 from lidar_perception.reproduction.studies import STUDIES
-from lidar_perception.runs.machine import cores, cpu_name
+from lidar_perception.runs.machine import count_cores, read_cpu_name
 from lidar_perception.types import InputError
 
 EXPERIMENTS = {"stm-cpa": "lidar_perception.reproduction.stm_cpa:STM_CPA"}
@@ -69,7 +69,7 @@ def reproduce(words: tuple[str, ...], study: str | None, data: Path | None,
     recording = opened(data, split=split)
     recording.require(BOXES, "reproduce")
     started, before = datetime.now().astimezone(), perf_counter()
-    workers = jobs or cores()
+    workers = jobs or count_cores()
     records = run(chosen, recording, out, jobs=workers, dask=dask, force=force, limit=limit)
     seconds = perf_counter() - before
     sections = chosen.sections(records)
@@ -78,7 +78,7 @@ def reproduce(words: tuple[str, ...], study: str | None, data: Path | None,
         "started": started.isoformat(" ", "seconds"),
         "duration of this run": f"{seconds:.0f} s" + (
             f" on the cluster at {dask}" if dask else f", processes: {workers}"),
-        "machine": f"{cpu_name()}, {os.cpu_count()} cores; Python {platform.python_version()}",
+        "machine": f"{read_cpu_name()}, {os.cpu_count()} cores; Python {platform.python_version()}",
         "version": f"lidar_perception {__version__}"}
     page = write_report(out, chosen, records, sections, about)
     if all("skipped" in record for record in records):

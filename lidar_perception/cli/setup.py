@@ -14,7 +14,7 @@ from rich.text import Text
 from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import data_argument, out_folder
 from lidar_perception.runs.files import make_folder, write_text
-from lidar_perception.runs.terminal import console, errors, looking_through, progress
+from lidar_perception.runs.terminal import console, errors, make_progress, show_scanning
 from lidar_perception.types import InputError
 
 FILES = ("sensor.yaml", "robot.param.yaml", "report.html", "lidar_perception.rviz",
@@ -60,7 +60,7 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
     from lidar_perception.sensor_setup.scans import scan_of
     from lidar_perception.sensor_setup.told import told_by
 
-    with looking_through(data):
+    with show_scanning(data):
         clouds = open_clouds(data, topic)
     if topic is not None and not clouds.topic:
         raise InputError(f"--topic {topic} is for a bag, and {data} is {clouds.layout}")
@@ -68,7 +68,7 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
     errors.print(f"{data}: {clouds.layout}, {count}", style="dim")
     numbers, found, skipped = [], [], []
     chosen = choose_clouds(clouds.count, scans)
-    with progress() as bar:
+    with make_progress() as bar:
         task = bar.add_task("reading", total=len(chosen) + 2)
         for i in chosen:
             try:

@@ -13,11 +13,11 @@ from lidar_perception.cli.command import Choice, Command
 from lidar_perception.cli.data import out_folder
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labels.names import ALIASES
-from lidar_perception.runs.compiling import compilation_reported
-from lidar_perception.runs.folder import is_finished, unfinished
-from lidar_perception.runs.machine import cores
-from lidar_perception.runs.resuming import digest
-from lidar_perception.runs.terminal import console, track
+from lidar_perception.runs.compiling import report_compilation
+from lidar_perception.runs.machine import count_cores
+from lidar_perception.runs.resumable_folder import is_finished, make_resumable_folder
+from lidar_perception.runs.resuming import hash_names
+from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.simulation.dataset import FOLDERS, LAYOUTS, Plan, write_frames
 from lidar_perception.simulation.drive import longest_drive
 from lidar_perception.simulation.scene import MOST_PEOPLE, SCENES, Scenes
@@ -55,7 +55,7 @@ from lidar_perception.types import InputError
 @click.option("--resume", is_flag=True, help="Resume an unfinished data set; needs identical "
               "settings.")
 @click.option("--force", is_flag=True, help="Replace an earlier simulated data set in --out.")
-@compilation_reported()
+@report_compilation()
 def simulate(out: Path, layout: str, sensor_name: str, frames: int, seed: int,
              scene: str, kind: str | None, people: float, mount_height: float,
              streets_of: int | None, jobs: int | None, resume: bool, force: bool) -> None:
@@ -81,12 +81,12 @@ def simulate(out: Path, layout: str, sensor_name: str, frames: int, seed: int,
                                    "which can, and turn it into a bag with 'convert'")
         _bag(out, plan, force)
     else:
-        _data_set(out, plan, sensor_name, mount_height, jobs or cores(), resume, force)
+        _data_set(out, plan, sensor_name, mount_height, jobs or count_cores(), resume, force)
 
 
 def _bag(out: Path, plan: Plan, force: bool) -> None:
     scans = simulated_scans(plan.seed, plan.frames, plan.sensor, plan.streets_of, plan.scenes)
-    count = write_bag(out, track(scans, "simulating", plan.frames), force=force)
+    count = write_bag(out, show_progress(scans, "simulating", plan.frames), force=force)
     console.print(f"{out}: {count} scans")
 
 
@@ -94,7 +94,7 @@ def _data_set(out: Path, plan: Plan, sensor_name: str, mount_height: float, jobs
               resume: bool, force: bool) -> None:
     scenes = plan.scenes
     asked = {"format": plan.layout, "sensor": sensor_name, "height": plan.sensor.height,
-             "sensor_digest": digest([repr(plan.sensor)]), "seed": plan.seed,
+             "sensor_digest": hash_names([repr(plan.sensor)]), "seed": plan.seed,
              "frames": plan.frames, "scene": scenes.scene, "street": scenes.kind,
              "people": scenes.people, "streets_of": plan.streets_of, "version": __version__}
     options = {"format": plan.layout, "sensor": sensor_name, "mount-height": mount_height or None,
@@ -105,10 +105,10 @@ def _data_set(out: Path, plan: Plan, sensor_name: str, mount_height: float, jobs
         for word in (f"--{name}", str(value)))])
     complete, begun = resume and is_finished(out), False
     try:
-        with unfinished(out, asked, FOLDERS, resume=resume, force=force) as missing:
+        with make_resumable_folder(out, asked, FOLDERS, resume=resume, force=force) as missing:
             begun = True
             with closing(write_frames(out, plan, missing, jobs)) as written:
-                for _ in track(written, "simulating", len(missing)):
+                for _ in show_progress(written, "simulating", len(missing)):
                     pass
     except InputError as error:
         if not begun:

@@ -24,8 +24,8 @@ from lidar_perception.data.qos import LATCHED_QOS, SENSOR_QOS, complete_profile,
 from lidar_perception.data.record_file import RecordFile
 from lidar_perception.data.ros1_bag import Ros1File
 from lidar_perception.data.storage import END, START, StorageFile, Topic, merge_streams
-from lidar_perception.runs.files import check_free, refuse_others, require_name
-from lidar_perception.runs.resuming import locked
+from lidar_perception.runs.files import check_unused, refuse_other_files, require_name
+from lidar_perception.runs.resuming import lock_folder
 from lidar_perception.types import InputError, InputWarning
 from lidar_perception.wire.codec import decode, encode, load_typestore
 from lidar_perception.wire.compression import decompress_message
@@ -69,16 +69,16 @@ class BagWriter:
         self._check_target()
 
     def _check_target(self) -> None:
-        check_free(self.path, self.force)
+        check_unused(self.path, self.force)
         if self.path.exists():
             if not (self.path / "metadata.yaml").is_file():
                 raise InputError(f"{self.path} is not a bag and is not overwritten; give another "
                                  "name")
-            refuse_others(self.path, ("metadata.yaml", "*.mcap*", "*.db3*"))
+            refuse_other_files(self.path, ("metadata.yaml", "*.mcap*", "*.db3*"))
 
     def __enter__(self) -> BagWriter:
         with ExitStack() as stack, self._named():
-            stack.enter_context(locked(self.partial))
+            stack.enter_context(lock_folder(self.partial))
             self._check_target()  # another process may just have written it
             for old in self.partial.iterdir():
                 shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()

@@ -14,7 +14,7 @@ from lidar_perception.data.pcd import read_pcd
 from lidar_perception.data.ply import read_ply
 from lidar_perception.data.recorded_scale import make_scale_reader
 from lidar_perception.data.records import read_records
-from lidar_perception.runs.files import regular, short
+from lidar_perception.runs.files import check_regular, shorten_error
 from lidar_perception.types import MAX_RANGE, InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import read_raw_intensity, to_frame
@@ -129,11 +129,11 @@ def read_npy(file: Path) -> np.ndarray:
         InputError: the array has another shape or type.
     """
     try:
-        array = np.array(np.load(regular(file), mmap_mode="r", allow_pickle=False))
+        array = np.array(np.load(check_regular(file), mmap_mode="r", allow_pickle=False))
     except (OSError, ValueError, EOFError, TypeError, LookupError, OverflowError, MemoryError,
             SyntaxError, TokenError, RecursionError) as error:  # the header is Python source
-        raise InputError(f"{file} is not a readable .npy file ({short(error)}); save it again with "
-                         "numpy.save") from None
+        raise InputError(f"{file} is not a readable .npy file ({shorten_error(error)}); save it "
+                         "again with numpy.save") from None
     if array.dtype.names:
         return array.reshape(-1)
     if array.ndim != 2 or not 3 <= array.shape[1] <= MAX_COLUMNS or array.dtype.kind != "f":

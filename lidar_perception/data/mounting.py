@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from lidar_perception.runs.files import read_text, write_text
-from lidar_perception.runs.folder import MARK, RECORD
+from lidar_perception.runs.resumable_folder import INCOMPLETE_NAME, RECORD_NAME
 from lidar_perception.types import InputError
 
 MOUNT = "mount.json"  # written by `convert`
@@ -28,7 +28,7 @@ def read_height(path: Path) -> float | None:
     None unless `convert` or `simulate` stored it in the path or a folder above it.
     """
     for folder in (path, *path.absolute().parents[:MAX_DEPTH]):
-        for name in (MOUNT, RECORD, MARK):
+        for name in (MOUNT, RECORD_NAME, INCOMPLETE_NAME):
             with suppress(InputError, ValueError, RecursionError):
                 content = json.loads(read_text(folder / name, MAX_BYTES))
                 if isinstance(content, dict) and (name == MOUNT or SIMULATION_KEY in content):

@@ -17,7 +17,7 @@ from lidar_perception.data.mcap_file import McapFile
 from lidar_perception.data.ros1_bag import Ros1File
 from lidar_perception.data.sqlite_file import SqliteFile
 from lidar_perception.data.storage import StorageFile
-from lidar_perception.runs.files import regular, short
+from lidar_perception.runs.files import check_regular, shorten_error
 from lidar_perception.types import InputError
 from lidar_perception.wire.compression import ZSTD_MAGIC
 
@@ -54,12 +54,12 @@ def find_files(path: Path, metadata: Metadata) -> list[Path]:
     if not path.exists():
         raise InputError(f"the bag {path} does not exist")
     if not path.is_dir():
-        return [regular(path)]
+        return [check_regular(path)]
     if metadata.compression not in ("", "zstd"):
         raise InputError(f"{path} is compressed by {metadata.compression}, which is not "
                          "supported; decompress it with 'ros2 bag convert'")
     for file in path.iterdir():
-        regular(file)
+        check_regular(file)
     found = list_storage_files(path)
     if not (path / NAME).exists():
         if len(found) == 1 or (found and _are_parts_of_one_bag(found)):
@@ -111,7 +111,7 @@ def open_file(path: Path, stack: ExitStack) -> StorageFile:
 
 def describe_damage(path: Path, error: Exception | str) -> str:
     """Return the error message for a damaged bag, with the reason and the remedy."""
-    reason = error if isinstance(error, str) else short(error).rstrip(".")
+    reason = error if isinstance(error, str) else shorten_error(error).rstrip(".")
     remedy = FORMATS.get(_suffix(path), FORMATS[".mcap"])[-1]
     return f"the bag {path} is truncated or damaged ({reason}); '{remedy}' may recover messages"
 

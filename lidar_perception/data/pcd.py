@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.runs.files import regular
+from lidar_perception.runs.files import check_regular
 from lidar_perception.types import InputError
 
 MAX_HEADER_BYTES = 1 << 16
@@ -28,7 +28,7 @@ def read_pcd(path: Path) -> np.ndarray:
         InputError: the file is not a PCD file, or truncated.
     """
     try:
-        content = regular(path).read_bytes()
+        content = check_regular(path).read_bytes()
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; download it again") from None
     try:

@@ -12,7 +12,7 @@ from lidar_perception.data.pcd import (
     parse_binary_points,
     parse_text_points,
 )
-from lidar_perception.runs.files import regular
+from lidar_perception.runs.files import check_regular
 from lidar_perception.types import InputError
 
 DTYPE_CODES = {
@@ -34,7 +34,7 @@ def read_ply(path: Path) -> np.ndarray:
             or in an element before them in a binary file.
     """
     try:
-        content = regular(path).read_bytes()
+        content = check_regular(path).read_bytes()
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; download it again") from None
     try:

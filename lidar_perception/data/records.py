@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from lidar_perception.runs.files import regular
+from lidar_perception.runs.files import check_regular
 from lidar_perception.types import InputError
 
 
@@ -25,7 +25,7 @@ def read_records(path: Path, columns: str, dtype: DTypeLike = np.float32) -> np.
         InputError: the file is missing or truncated.
     """
     try:
-        numbers, size = np.fromfile(regular(path), dtype), path.stat().st_size
+        numbers, size = np.fromfile(check_regular(path), dtype), path.stat().st_size
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; download it again") from None
     count = len(columns.split())

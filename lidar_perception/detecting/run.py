@@ -22,7 +22,7 @@ from lidar_perception.detecting.results import FrameResult, by_detector, by_reco
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import Configured, kind_and_file
 from lidar_perception.param_fields import flatten
-from lidar_perception.runs.journal import journal
+from lidar_perception.runs.journal import open_journal
 from lidar_perception.scoring.run import complete, fill
 from lidar_perception.tracking.drive_tracker import DriveTracker
 from lidar_perception.tracking.params import TrackingParams
@@ -111,7 +111,7 @@ def detect(run: Run, open_: Callable[[], Detector], formats: Sequence[Callable[[
     """
     recording = run.recording
     tracker = None if tracking is None else partial(DriveTracker, params=tracking, ego=ego)
-    with journal(run.out, run.header, force=force, written=written) as done:
+    with open_journal(run.out, run.header, force=force, list_files=written) as done:
         names = [frame.name for frame in islice(recording, run.count)]
         complete(done, recording, by_detector(open_), names, jobs=jobs, dask=dask,
                  title="detecting")

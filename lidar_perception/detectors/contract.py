@@ -69,7 +69,7 @@ class Detector(Protocol):
 
 class Accepted(NamedTuple):
     """Checked arguments of a detector: the usable points of the cloud with the intensity in 0..1,
-    their columns, and the scale_problem() of the intensity."""
+    their columns, and the find_scale_problem() of the intensity."""
 
     frame: LidarFrame
     ground: np.ndarray | None

@@ -19,7 +19,7 @@ from lidar_perception.detectors.custom import (
 from lidar_perception.detectors.params import RANGE_CHOICES
 from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.param_fields import with_values
-from lidar_perception.runs.compiling import compilation_reported
+from lidar_perception.runs.compiling import report_compilation
 from lidar_perception.types import InputError, unknown_name
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class Configured(Detector, Protocol):
         """Return this detector with another range, see base.NetworkDetector."""
 
 
-@compilation_reported(all_of_it=True)
+@report_compilation(whole_detector=True)
 def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
                   sensor_height: float | None = None, min_score: float | None = None,
                   range: str = "auto", settings: Mapping[str, Any] = {}) -> Configured:

@@ -23,7 +23,7 @@ from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels, FrameLab
 from lidar_perception.labels.formats import kitti_object, kitti_tracking
 from lidar_perception.labels.formats.nuscenes import LIKE
 from lidar_perception.labels.names import format_name
-from lidar_perception.runs.files import whole_folder, write_bytes
+from lidar_perception.runs.files import write_bytes, write_folder
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import SENSOR_HEIGHT, InputError
 
@@ -71,7 +71,7 @@ def write_dataset(layout: str, frames: Iterable[Frame], out: Path,
     """
     layout = format_name(layout, LAYOUTS)
     summary = Summary()
-    with whole_folder(out, force) as folder:
+    with write_folder(out, force) as folder:
         for placed in LAYOUTS[layout](folder, _placed(frames, labels), summary):
             if placed.number == 0 and placed.frame.sensor_height != SENSOR_HEIGHT:
                 write_height(folder, placed.frame.sensor_height)

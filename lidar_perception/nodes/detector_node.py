@@ -12,8 +12,8 @@ from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import DetectionOutputs
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.runs.compiling import compilation_reported, one_at_a_time
-from lidar_perception.runs.machine import cores
+from lidar_perception.runs.compiling import lock_compilation, report_compilation
+from lidar_perception.runs.machine import count_cores
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.messages import read_cluster_ids, read_column
 from msg_utils.stamps import to_ns
@@ -32,7 +32,7 @@ class DetectorNode(ManagedNode):
     def configure(self) -> None:
         self.sensor = SensorCheck(self)
         self.outputs = DetectionOutputs(self, self.steps)
-        with compilation_reported(self.get_logger().info, all_of_it=True):
+        with report_compilation(self.get_logger().info, whole_detector=True):
             self.detector = self._loaded()
         config = self.detector.config
         self.counts.update(network=f"{self.name_of(config)}, {' '.join(config.classes)}",
@@ -65,14 +65,14 @@ class DetectorNode(ManagedNode):
 
         from lidar_perception.detectors.devices import chosen_device
         # 0 leaves torch with what main.py sets in the environment, which is one.
-        torch.set_num_threads(chosen.threads or cores())
+        torch.set_num_threads(chosen.threads or count_cores())
         device = chosen.device
         if device.startswith("cuda") and chosen.cpu_fallback:
             try:
                 chosen_device(device)
             except InputError as error:
                 device, missing = "cpu", f"{error}; the CPU is used"
-        with one_at_a_time(self.get_logger().info):
+        with lock_compilation(self.get_logger().info):
             detector = self.load(weights, device)
         detector.place.fallback = detector.fallback or missing
         return detector

@@ -38,10 +38,10 @@ def run(name: str, arguments: list[str]) -> int:
     """Run a node until SIGINT or SIGTERM (exit code 0), or until it is done. 2: it cannot start."""
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     begin = perf_counter()
-    from lidar_perception.runs.memory import keep_freed
-    from lidar_perception.runs.threads import one_thread_each
-    one_thread_each()  # or nodes that share few cores stand in each other's way
-    keep_freed()
+    from lidar_perception.runs.memory import keep_freed_memory
+    from lidar_perception.runs.threads import default_to_one_thread
+    default_to_one_thread()  # or nodes that share few cores stand in each other's way
+    keep_freed_memory()
     from lidar_perception.nodes.stopping import Stop
     stop = Stop(STOP_SIGNALS)
     if {"-h", "--help"} & set(arguments[1:]):
@@ -60,12 +60,12 @@ def run(name: str, arguments: list[str]) -> int:
         return 2
     from rclpy.logging import get_logger
 
-    from lidar_perception.runs.compiling import compilation_reported, one_at_a_time
+    from lidar_perception.runs.compiling import lock_compilation, report_compilation
     say = get_logger(_logger_name(arguments)).info
-    with compilation_reported(say):
+    with report_compilation(say):
         node_class = load_node_class(name)
         if warm_up := getattr(sys.modules[node_class.__module__], "warm_up", None):
-            with one_at_a_time(say):
+            with lock_compilation(say):
                 warm_up()
     return _spin(node_class, arguments, begin, stop)
 
@@ -112,7 +112,7 @@ def _spin(node_class: type, arguments: list[str], begin: float, stop: Stop) -> i
     from rclpy.signals import SignalHandlerOptions
 
     from lidar_perception.nodes.known import misspelt
-    from lidar_perception.runs.files import refusals_named
+    from lidar_perception.runs.files import convert_os_errors
     from lidar_perception.types import InputError
 
     RCLError = rclpy_implementation.RCLError
@@ -123,7 +123,7 @@ def _spin(node_class: type, arguments: list[str], begin: float, stop: Stop) -> i
     try:
         stop.react = lambda: None  # DDS has to be taken down from here on: see stop.asked
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        with refusals_named():
+        with convert_os_errors():
             node = node_class()
         stop.react = lambda: node.stop.set_result(None)
         if not node.writes_files:

@@ -15,8 +15,8 @@ from rclpy.node import Node
 
 from lidar_perception.nodes.runtime import ERROR, OK, WAITING, WARN, LidarNode
 from lidar_perception.nodes.transforms import Transforms
-from lidar_perception.runs.compiling import compilation_reported
-from lidar_perception.runs.files import refusals_named
+from lidar_perception.runs.compiling import report_compilation
+from lidar_perception.runs.files import convert_os_errors
 from lidar_perception.types import InputError
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -62,7 +62,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
 
     def _configure(self) -> None:
         self.transforms = Transforms(self)
-        with compilation_reported(self.get_logger().info):
+        with report_compilation(self.get_logger().info):
             self.configure()
 
     def is_ready(self) -> bool:
@@ -177,7 +177,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
     def _problem_of(self, step: Callable[[], Any]) -> str | None:
         """What step() fails for; what is no InputError is logged in full, once."""
         try:
-            with refusals_named():
+            with convert_os_errors():
                 step()
         except InputError as error:
             return str(error)

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from lidar_perception.nodes import NODES
-from lidar_perception.runs.files import read_text, short
+from lidar_perception.runs.files import read_text, shorten_error
 from lidar_perception.types import InputError, closest_name
 
 MAX_BYTES = 10**6
@@ -33,7 +33,7 @@ def read_sections(path: str | Path) -> dict[str, dict[str, Any]]:
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"cannot read the parameter file {path}: {short(error)}") from None
+        raise InputError(f"cannot read the parameter file {path}: {shorten_error(error)}") from None
     if not isinstance(content, dict):
         raise InputError(f"{path} is not a parameter file; see config/ for the form")
     visited = count()

@@ -20,7 +20,7 @@ from lidar_perception.reproduction.experiment import Cell, Experiment, Figure, S
 from lidar_perception.reproduction.figures import draw
 from lidar_perception.reproduction.report_files import REPORT
 from lidar_perception.runs.files import write_bytes, write_text
-from lidar_perception.runs.page import data_url, render
+from lidar_perception.runs.page import render_page, to_data_url
 
 LEGEND = ("A figure, [its 95 % interval] from drawing the frames anew with replacement "
           "(bootstrap), and the paper's figure. An interval from a few frames, or from frames that "
@@ -78,9 +78,9 @@ def to_html(experiment: Experiment, sections: list[Section], about: dict[str, st
             skipped: list[dict[str, Any]]) -> str:
     """One page that needs no other file."""
     def picture(figure: Figure, dark: bool) -> str:
-        return data_url(draw(figure, "svg", dark=dark), "svg+xml")
+        return to_data_url(draw(figure, "svg", dark=dark), "svg+xml")
 
-    return render(
+    return render_page(
         "reproduction/report.html", title=experiment.title, question=experiment.question,
         about=about, skipped=skipped, sections=sections, legend=LEGEND, max_rows=MAX_ROWS,
         parts=parts, picture=picture, is_number=is_number)

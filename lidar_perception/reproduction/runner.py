@@ -15,8 +15,8 @@ from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.reproduction.experiment import Experiment
 from lidar_perception.reproduction.report_files import written
-from lidar_perception.runs.journal import journal
-from lidar_perception.runs.resuming import digest
+from lidar_perception.runs.journal import open_journal
+from lidar_perception.runs.resuming import hash_names
 from lidar_perception.scoring.run import complete
 
 
@@ -35,9 +35,9 @@ def run(experiment: Experiment, recording: Recording, out: Path, *, jobs: int = 
     names = [frame.name for frame in recording]
     plan = {"experiment": experiment.name, "version": __version__,
             "data": str(recording.path.resolve()), "frames": len(names),
-            "frame_names": digest(names),
+            "frame_names": hash_names(names),
             "settings": experiment.settings}
-    with journal(out, plan, force=force, written=written) as done, threadpool_limits(1):
+    with open_journal(out, plan, force=force, list_files=written) as done, threadpool_limits(1):
         complete(done, recording, functools.partial(_measurer, experiment), names[:limit],
                  jobs=jobs, dask=dask, title=experiment.name)
         done.sort(names)

@@ -1,1 +1,1 @@
-"""Running things: files, processes, resuming, the terminal."""
+"""Long-running commands: files, processes, resuming, the terminal, compilation."""

@@ -1,6 +1,6 @@
-"""The first compilation on a machine: reported while it lasts, in one process at a time.
+"""First compilation on a machine: reported while it runs, in one process at a time.
 
-Numba caches what it has compiled, so a later start loads it in a few seconds.
+Numba caches compiled code, so a later start loads it in a few seconds.
 """
 
 from __future__ import annotations
@@ -15,99 +15,100 @@ from pathlib import Path
 from time import perf_counter, sleep
 from typing import Any
 
-PATIENCE = 1.0  # seconds of compiling or waiting that are not reported
-EVERY = 10.0    # seconds of compilation between two reports
-TICK = 0.1      # seconds
+REPORT_AFTER_S = 1.0      # shorter compilations and waits are not reported
+REPORT_INTERVAL_S = 10.0  # compilation time between two reports
+POLL_INTERVAL_S = 0.1
 
 COMPILING = ("compiling numeric code for this machine, once: about a minute on a free core; the "
              "result is cached")
-WAITING = "waiting for another process to compile, or to load what is compiled"
+WAITING = "waiting for another process to compile, or to load compiled code"
 
 
 class _Compilation:
-    """A listener to the events of Numba, which sends none when it loads code from its cache."""
+    """Listener to Numba's events; Numba sends none when it loads code from its cache."""
 
-    current: _Compilation | None = None  # of the outermost block
+    current: _Compilation | None = None  # that of the outermost block
 
-    def __init__(self, say: Callable[[str], object]):
-        self.say, self.over = say, threading.Event()
+    def __init__(self, report: Callable[[str], object]):
+        self.report, self.finished = report, threading.Event()
         self.count = self.depth = 0
-        self.seconds = self.begun = 0.0
-        self.said = False
+        self.seconds = self.start = 0.0
+        self.announced = False
 
     def notify(self, event: Any) -> None:
         """Numba calls this, under its compiler lock, when it begins and ends a function."""
         if event.is_start:
-            self.begun = self.begun if self.depth else perf_counter()
+            self.start = self.start if self.depth else perf_counter()
             self.depth += 1
             return
         self.depth -= 1
         self.count += 1
         if not self.depth:
-            self.seconds += perf_counter() - self.begun
+            self.seconds += perf_counter() - self.start
 
-    def spent(self) -> float:
-        """Seconds of compilation so far."""
-        return self.seconds + (perf_counter() - self.begun if self.depth else 0.0)
+    def elapsed(self) -> float:
+        """Return the compilation time so far, in seconds."""
+        return self.seconds + (perf_counter() - self.start if self.depth else 0.0)
 
-    def begin(self) -> None:
-        """Say that it begins, once."""
-        if not self.said:
-            self.said = True
-            self.say(COMPILING)
+    def announce(self) -> None:
+        """Report the start of the compilation, once."""
+        if not self.announced:
+            self.announced = True
+            self.report(COMPILING)
 
-    def report(self) -> None:
-        """Say how far it is, until the block is over."""
-        limit = PATIENCE
-        while not self.over.wait(TICK):
-            if (spent := self.spent()) < limit:
+    def report_until_finished(self) -> None:
+        """Report the progress until the block ends."""
+        limit = REPORT_AFTER_S
+        while not self.finished.wait(POLL_INTERVAL_S):
+            if (elapsed := self.elapsed()) < limit:
                 continue
-            if self.said and spent >= EVERY:
-                self.say(f"compiling: {self.count} functions in {spent:.0f} s so far")
-            self.begin()
-            limit = max(EVERY, spent + EVERY)
+            if self.announced and elapsed >= REPORT_INTERVAL_S:
+                self.report(f"compiling: {self.count} functions in {elapsed:.0f} s so far")
+            self.announce()
+            limit = max(REPORT_INTERVAL_S, elapsed + REPORT_INTERVAL_S)
 
 
 @contextmanager
-def compilation_reported(say: Callable[[str], object] | None = None,
-                         all_of_it: bool = False) -> Iterator[None]:
-    """Report when Numba compiles for more than PATIENCE seconds within the block.
+def report_compilation(report: Callable[[str], object] | None = None,
+                       whole_detector: bool = False) -> Iterator[None]:
+    """Report when Numba compiles for more than REPORT_AFTER_S within the block.
 
     Args:
-        say: takes each line; None: standard error. Of nested blocks that of the outermost.
-        all_of_it: the block runs what a detector runs, so it compiles where nothing is cached yet;
-            that is reported at its start, before torch is loaded.
+        report: called with each line, by default prints to standard error. Nested blocks use that
+            of the outermost block.
+        whole_detector: the block runs a whole detector, so it compiles if nothing is cached yet;
+            this is reported at once, before torch is loaded.
     """
     outer = _Compilation.current
     if outer is not None:
-        if all_of_it and not _cached():
-            outer.begin()
+        if whole_detector and not _is_cached():
+            outer.announce()
         yield
         return
     from numba.core import event
-    if say is None:
+    if report is None:
         from lidar_perception.runs.terminal import errors
-        say = errors.print
-    event.Listener.register(_Compilation)  # as a base class numba would be loaded at import
-    _Compilation.current = compilation = _Compilation(say)
-    reporter = threading.Thread(target=compilation.report, daemon=True)
+        report = errors.print
+    event.Listener.register(_Compilation)  # a base class would load numba at import
+    _Compilation.current = compilation = _Compilation(report)
+    reporter = threading.Thread(target=compilation.report_until_finished, daemon=True)
     event.register("numba:compile", compilation)
     reporter.start()
     try:
-        if all_of_it and not _cached():
-            compilation.begin()
+        if whole_detector and not _is_cached():
+            compilation.announce()
         yield
     finally:
         _Compilation.current = None
         event.unregister("numba:compile", compilation)
-        compilation.over.set()
+        compilation.finished.set()
         reporter.join()
-    if compilation.count and compilation.said:
-        say(f"compiled {compilation.count} functions in {compilation.seconds:.1f} s")
+    if compilation.count and compilation.announced:
+        report(f"compiled {compilation.count} functions in {compilation.seconds:.1f} s")
 
 
-def _cached() -> bool:
-    """Return True if Numba has cached a function that all detectors use, since its file changed."""
+def _is_cached() -> bool:
+    """Return True if Numba's cache of a function that all detectors use is up to date."""
     from lidar_perception import geometry
     function: Any = geometry.counting_sort
     source = Path(geometry.__file__)
@@ -118,28 +119,28 @@ def _cached() -> bool:
 
 
 @contextmanager
-def one_at_a_time(say: Callable[[str], object]) -> Iterator[None]:
+def lock_compilation(report: Callable[[str], object]) -> Iterator[None]:
     """Wait until no other process of this user is in such a block.
 
-    The first node compiles and the others load what it has cached. If all compiled the same
-    functions at once on few cores, each would take as many times longer.
+    The first node compiles, and the others load the cached code. If all nodes compiled the same
+    functions at the same time on few cores, each would take many times longer.
 
     Args:
-        say: takes a line when the wait is long, and one with its duration.
+        report: called with a line when the wait is long, and with its duration at the end.
     """
     with open(Path(tempfile.gettempdir()) / f"lidar_perception-{os.getuid()}.lock", "w") as lock:
-        begin, said = perf_counter(), False
-        while not _locked(lock):
-            sleep(TICK)
-            if not said and perf_counter() - begin > PATIENCE:
-                say(WAITING)
-                said = True
-        if said:
-            say(f"waited {perf_counter() - begin:.1f} s for another process to compile")
+        start, reported = perf_counter(), False
+        while not _try_lock(lock):
+            sleep(POLL_INTERVAL_S)
+            if not reported and perf_counter() - start > REPORT_AFTER_S:
+                report(WAITING)
+                reported = True
+        if reported:
+            report(f"waited {perf_counter() - start:.1f} s for another process to compile")
         yield
 
 
-def _locked(file: Any) -> bool:
+def _try_lock(file: Any) -> bool:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

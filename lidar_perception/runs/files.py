@@ -1,5 +1,4 @@
-"""Writing files so that a crash never destroys what was there, and reading small ones that anyone
-may have written."""
+"""Atomic writing of files and folders, and careful reading of small files."""
 
 from __future__ import annotations
 
@@ -18,43 +17,47 @@ from lidar_perception.types import InputError
 _calls = itertools.count()
 
 
-def regular(path: Path) -> Path:
-    """The path itself. InputError for what is neither file nor folder, such as a pipe or a device,
-    from which a read may wait for ever, and for a name that no file can have; what is not there
-    passes."""
+def check_regular(path: Path) -> Path:
+    """Return the path if it is a regular file, a folder, or does not exist.
+
+    Raises:
+        InputError: for a pipe or a device, which a read may block on, and for an invalid name.
+    """
     if "\0" in str(path):
-        raise InputError(f"{str(path)!r} is no name of a file; correct it where it comes from")
+        raise InputError(f"{str(path)!r} is not a valid file name; correct it")
     if path.exists() and not path.is_file() and not path.is_dir():
-        raise InputError(f"{path} is no file; give the path of one")
+        raise InputError(f"{path} is not a regular file")
     return path
 
 
-MAX_TEXT = 2**28  # bytes of a file of numbers or labels
+MAX_TEXT_BYTES = 2**28  # of a file of numbers or labels
 
 
-def read_text(path: str | Path, max_bytes: int = MAX_TEXT, what: str = "") -> str:
-    """Read the UTF-8 text of a file of at most max_bytes, without a byte order mark. InputError,
-    in which `what` describes the file, where it cannot be read; also for a pipe or a device, from
-    which a read may wait for ever."""
+def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES, what: str = "") -> str:
+    """Read the UTF-8 text of a file of at most max_bytes, without a byte order mark.
+
+    Raises:
+        InputError: if it cannot be read, or is a pipe or a device; `what` describes the file.
+    """
     named = f"{what} {path}" if what else str(path)
     path = Path(path)
     try:
-        with open(regular(path), "rb") as stream:
+        with open(check_regular(path), "rb") as stream:
             content = stream.read(max_bytes + 1)
         if len(content) > max_bytes:
-            raise InputError(f"{path} has more than {max_bytes} bytes, which is no file of this "
+            raise InputError(f"{path} has more than {max_bytes} bytes, too many for a file of this "
                              "kind; give another one")
-        return content.decode("utf-8-sig")  # as editors of Windows begin it
+        return content.decode("utf-8-sig")  # editors on Windows write a byte order mark
     except OSError as error:
         raise InputError(f"cannot read {named}: {error.strerror or error}") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"cannot read {named}: it is no UTF-8 text ({error.reason} at byte "
+        raise InputError(f"cannot read {named}: it is not UTF-8 text ({error.reason} at byte "
                          f"{error.start})") from None
 
 
 @contextmanager
-def refusals_named() -> Iterator[None]:
-    """A file that the system refuses (no permission, too long a name) is an InputError."""
+def convert_os_errors() -> Iterator[None]:
+    """Convert errors about a file (no permission, name too long) to InputError."""
     try:
         yield
     except OSError as error:
@@ -63,22 +66,25 @@ def refusals_named() -> Iterator[None]:
         raise InputError(f"{error.filename}: {error.strerror}") from error
 
 
-def short(error: BaseException, length: int = 200) -> str:
-    """What an error says, in one line of at most so many characters; its type if it is silent."""
+def shorten_error(error: BaseException, length: int = 200) -> str:
+    """Return the first line of an error's message, at most `length` characters, or its type."""
     line = (str(error).strip().splitlines() or [type(error).__name__])[0]
     return line if len(line) <= length else f"{line[:length - 3]}..."
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """As write_bytes, UTF-8, with a line feed at the end."""
+    """Write UTF-8 text as write_bytes does, with a line feed at the end."""
     write_bytes(path, (text if text.endswith("\n") else text + "\n").encode())
 
 
 def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
-    """Write, fsync, rename: path holds the old content or the whole new one, never a part.
-    InputError where it cannot be written."""
+    """Write a file atomically: path holds the old content or the new one, never a part.
+
+    Raises:
+        InputError: if it cannot be written.
+    """
     path = Path(path)
-    temporary = _beside(path)
+    temporary = _make_temporary_path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(temporary, "wb") as stream:
@@ -92,29 +98,29 @@ def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
         raise InputError(f"cannot write {path}: {error.strerror}") from None
 
 
-def _beside(path: Path) -> Path:
-    """A hidden name in the same folder that no other process and no other call takes. InputError
-    for a path that ends with no name."""
+def _make_temporary_path(path: Path) -> Path:
+    """Return a hidden path in the same folder that no other process and no other call uses."""
     require_name(path)
     return path.with_name(f".{path.name}.{os.getpid()}-{next(_calls)}.tmp")
 
 
 def require_name(path: Path) -> None:
-    """InputError for a path, such as `.`, without a name of its own, beside which something is
-    written first."""
+    """Raise InputError for a path without a name, such as `.`, which a temporary file needs."""
     if not path.name:
-        raise InputError(f"{path} is no name for something new; give one, such as {path / 'out'}")
+        raise InputError(f"{path} has no name for a new file; give one, such as {path / 'out'}")
 
 
-def check_free(path: Path, force: bool) -> None:
-    """InputError for what is there already, but with force."""
+def check_unused(path: Path, force: bool) -> None:
+    """Raise InputError if the path exists, unless force."""
     if path.exists() and not force:
         raise InputError(f"{path} exists already; give another name or --force")
 
 
-def refuse_others(folder: Path, ours: Iterable[str]) -> None:
-    """InputError that names what is in a folder beside what fits the patterns of `ours`, and would
-    be removed with it."""
+def refuse_other_files(folder: Path, ours: Iterable[str]) -> None:
+    """Raise InputError if a folder has files that do not match the patterns `ours`.
+
+    They would be removed together with the others.
+    """
     ours = [*ours, "*.tmp"]
     if others := sorted(path.name for path in folder.iterdir()
                         if not any(fnmatch(path.name, pattern) for pattern in ours)):
@@ -123,13 +129,17 @@ def refuse_others(folder: Path, ours: Iterable[str]) -> None:
 
 
 @contextmanager
-def whole_folder(path: Path, force: bool = False) -> Iterator[Path]:
-    """A folder to write into, whose files appear under `path` when all of them are complete; after
-    an error there is nothing new. InputError where they cannot be written or `path` exists; with
-    force they replace files of the same names there, and InputError names a file that would be left
-    among them."""
-    check_free(path, force)
-    hidden = _beside(path)
+def write_folder(path: Path, force: bool = False) -> Iterator[Path]:
+    """Yield a temporary folder whose files move to `path` when the block ends without an error.
+
+    With force, they replace files of the same names.
+
+    Raises:
+        InputError: if they cannot be written, if `path` exists and force is False, or if `path` has
+            a file that would not be replaced.
+    """
+    check_unused(path, force)
+    hidden = _make_temporary_path(path)
     try:
         make_folder(hidden)
         yield hidden
@@ -151,18 +161,21 @@ def whole_folder(path: Path, force: bool = False) -> Iterator[Path]:
         shutil.rmtree(hidden, ignore_errors=True)
 
 
-def check_folder(path: Path) -> None:
-    """Raise InputError if a folder cannot be made or written into. Nothing is made."""
-    above = next(each for each in (path, *path.absolute().parents) if each.exists())
-    if not above.is_dir():
-        raise InputError(f"cannot write into the folder {path}: {above} is a file")
-    if not os.access(above, os.W_OK | os.X_OK):
+def check_writable_folder(path: Path) -> None:
+    """Raise InputError if a folder cannot be created or written into. Nothing is created."""
+    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not existing.is_dir():
+        raise InputError(f"cannot write into the folder {path}: {existing} is a file")
+    if not os.access(existing, os.W_OK | os.X_OK):
         raise InputError(f"cannot write into the folder {path}: {os.strerror(errno.EACCES)}")
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder, with those above it, if it is not there. InputError where that cannot be, or
-    nothing can be written into it."""
+    """Create a folder and its parents if needed.
+
+    Raises:
+        InputError: if it cannot be created or written into.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
         if not os.access(path, os.W_OK | os.X_OK):
@@ -174,9 +187,11 @@ def make_folder(path: Path) -> None:
 
 
 def remove_temporaries(folder: Path, *names: str) -> None:
-    """Remove what a killed process left in folder, not in those below, of files that it was writing
-    under names that fit one of these patterns. Nobody may be writing there."""
+    """Remove the temporary files of a killed process from a folder, but not from its subfolders.
+
+    names are patterns of the files that were being written. No other process may write there.
+    """
     for path in folder.glob(".*.tmp"):
-        written = re.fullmatch(r"\.(.+)\.\d+-\d+\.tmp", path.name)  # see _beside
+        written = re.fullmatch(r"\.(.+)\.\d+-\d+\.tmp", path.name)  # see _make_temporary_path
         if written and any(fnmatch(written[1], name) for name in names) and path.is_file():
             path.unlink(missing_ok=True)

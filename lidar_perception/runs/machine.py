@@ -1,4 +1,4 @@
-"""What this machine is."""
+"""Properties of this machine."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from functools import cache
 from pathlib import Path
 
 
-def cpu_name() -> str:
-    """The model of the processor, as the system names it."""
+def read_cpu_name() -> str:
+    """Return the model name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(x.split(":")[1].strip() for x in lines if x.startswith("model name"))
@@ -17,14 +17,14 @@ def cpu_name() -> str:
         return platform.processor()
 
 
-def cores() -> int:
-    """Cores that this process may use."""
+def count_cores() -> int:
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
 @cache
 def has_bf16() -> bool:
-    """Whether the processor has instructions for bf16, with which networks take half the time."""
+    """Return True if the processor has bf16 instructions, which halve the time of networks."""
     try:
         flags = Path("/proc/cpuinfo").read_text().partition("flags")[2].partition("\n")[0].split()
     except OSError:

@@ -1,4 +1,4 @@
-"""Reports as HTML pages that need no other file."""
+"""Reports as self-contained HTML pages."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import base64
 from typing import Any
 
 
-def render(template: str, **values: Any) -> str:
-    """The page of a template inside the package, such as "sensor_setup/report.html", which extends
-    runs/page.html. It escapes values, and a name without a value is an error."""
+def render_page(template: str, **values: Any) -> str:
+    """Render a template of the package, such as "sensor_setup/report.html".
+
+    Templates extend runs/page.html. Values are escaped; a name without a value is an error.
+    """
     import jinja2
 
     return jinja2.Environment(
@@ -16,6 +18,6 @@ def render(template: str, **values: Any) -> str:
         undefined=jinja2.StrictUndefined).get_template(template).render(values)
 
 
-def data_url(picture: bytes, kind: str = "png") -> str:
-    """What <img> shows without a file; kind: png or svg+xml."""
+def to_data_url(picture: bytes, kind: str = "png") -> str:
+    """Encode a picture as a data URL for <img>; kind is png or svg+xml."""
     return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"

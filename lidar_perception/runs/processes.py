@@ -1,5 +1,7 @@
-"""Work on many items in many processes that end with the one that started them: after ctrl-C, after
-a kill, out of memory."""
+"""Work on many items in several processes, which end with the process that started them.
+
+They end after ctrl-C, after the parent was killed, and when memory runs out.
+"""
 
 from __future__ import annotations
 
@@ -21,106 +23,121 @@ from threading import Thread
 from time import monotonic
 from typing import Any, cast
 
-from lidar_perception.runs.threads import one_thread_here
+from lidar_perception.runs.threads import limit_to_one_thread
 from lidar_perception.types import InputError
 
-PATIENCE = 30.0  # seconds, with processes that have been asked to end
+EXIT_TIMEOUT_S = 30.0  # for processes that have been asked to end
 
 
-def in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, jobs: int,
-                 what: str, *, apart: bool = False) -> Generator:
-    """start()(item) of all items, in the order in which they are done.
+def run_in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, jobs: int,
+                     what: str, *, apart: bool = False) -> Generator:
+    """Yield start()(item) of all items, in the order in which they are finished.
 
-    start is called once in each of `jobs` new processes, and can be pickled; with one job or one
-    item there is no new process, unless they are to be done apart. Several processes share the
-    cores, so each computes with one thread. They are forked from a process that has imported what
-    start needs, and nothing else has run in. InputError, and the end of all processes, where one
-    fails: its own, or, naming what it did ("wrote frames"), where a process
-    ended. They end with the iterator too.
+    Processes are forked from a process that has only imported the modules of `start`. Several
+    processes share the cores, so each uses one thread. All of them end with the iterator.
+
+    Args:
+        start: picklable; called once in each new process.
+        jobs: number of processes. With one job or one item there is no new process, unless apart.
+        what: names the work for errors, such as "wrote frames".
+
+    Raises:
+        InputError: raised by a worker, or if a worker died. All processes are ended.
     """
     jobs = min(jobs, len(items))
     if jobs <= 1 and not apart:
         if items:
             yield from map(start(), items)
         return
-    context = _context(start)
+    context = _make_context(start)
     running: dict[Connection, ForkServerProcess] = {}
     try:
         for j in range(jobs):
             receiver, sender = context.Pipe(duplex=False)
-            running[receiver] = _begun(context, _work, start, items[j::jobs], jobs > 1, sender)
+            running[receiver] = _start_process(context, _run_items, start, items[j::jobs], jobs > 1,
+                                               sender)
         while running:
             for receiver in cast(list[Connection], wait(list(running))):
-                yield from _receive(receiver, running, what)
+                yield from _receive_result(receiver, running, what)
     finally:
-        _end(running)
+        _end_processes(running)
 
 
-def in_order(start: Callable[[], Callable[[Any], Any]], items: Iterable, jobs: int, ahead: int,
-             what: str) -> Generator:
-    """start()(item) of all items, of which there may be no end, in their order. As in_processes,
-    with a new process, of one thread, for a single job too; each makes up to `ahead` items that
-    nobody has asked for yet."""
+def run_in_order(start: Callable[[], Callable[[Any], Any]], items: Iterable, jobs: int, ahead: int,
+                 what: str) -> Generator:
+    """Yield start()(item) of all items, which may be endless, in their order.
+
+    As run_in_processes, but a single job also gets a new process of one thread. Each process works
+    up to `ahead` items ahead of the caller.
+    """
     waiting = iter(items)
     first = list(islice(waiting, jobs * ahead))
-    context = _context(start)
-    crew: dict[Connection, ForkServerProcess] = {}
+    context = _make_context(start)
+    running: dict[Connection, ForkServerProcess] = {}
     try:
         for _ in first[:jobs]:
-            here, there = context.Pipe()
-            crew[here] = _begun(context, _serve, start, there)
-        pipes = list(crew)
-        asked = deque(_asked(pipes[k % len(pipes)], item) for k, item in enumerate(first))
-        while asked:
-            pipe = asked.popleft()
-            for result in _receive(pipe, crew, what):
-                asked += [_asked(pipe, item) for item in islice(waiting, 1)]
+            own_end, worker_end = context.Pipe()
+            running[own_end] = _start_process(context, _serve, start, worker_end)
+        pipes = list(running)
+        pending = deque(_send_item(pipes[k % len(pipes)], item) for k, item in enumerate(first))
+        while pending:
+            pipe = pending.popleft()
+            for result in _receive_result(pipe, running, what):
+                pending += [_send_item(pipe, item) for item in islice(waiting, 1)]
                 yield result
     finally:
-        _end(crew)
+        _end_processes(running)
 
 
-def _context(start: Callable) -> ForkServerContext:
+def _make_context(start: Callable) -> ForkServerContext:
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([*_modules(start)])
+    context.set_forkserver_preload([*_find_modules(start)])
     return context
 
 
-def _begun(context: ForkServerContext, work: Callable, *args: Any) -> ForkServerProcess:
-    """A process that does work(*args). The last argument is its end of a pipe, which nobody else
-    keeps: so the pipe ends with the process, even one that is killed in the middle of a result."""
+def _start_process(context: ForkServerContext, work: Callable, *args: Any) -> ForkServerProcess:
+    """Start a process that runs work(*args). The last argument is its end of a pipe.
+
+    No other process keeps that end, so the pipe closes with the process, even if it is killed while
+    it sends a result.
+    """
     process = context.Process(target=work, args=args, daemon=True)
-    with _without_interrupts():
+    with _block_interrupts():
         process.start()
     args[-1].close()
     return process
 
 
-def _end(running: dict[Connection, ForkServerProcess]) -> None:
+def _end_processes(running: dict[Connection, ForkServerProcess]) -> None:
     for process in running.values():
         process.terminate()
     for pipe in running:
         pipe.close()
-    end = monotonic() + PATIENCE
+    end = monotonic() + EXIT_TIMEOUT_S
     for process in running.values():
         process.join(max(0.0, end - monotonic()))
-        process.kill()  # one that has not ended, such as one that was interrupted with a lock held
+        process.kill()  # if it has not ended, for example because it was interrupted holding a lock
         process.join()
 
 
-def _modules(work: Any) -> set[str]:
-    """Where functions and objects come from that a process is given."""
+def _find_modules(work: Any) -> set[str]:
+    """Return the modules of the functions and objects that a process is given."""
     if isinstance(work, partial):
-        return set[str]().union(*map(_modules, (work.func, *work.args, *work.keywords.values())))
+        return set[str]().union(*map(_find_modules,
+                                     (work.func, *work.args, *work.keywords.values())))
     return {getattr(work, "__module__", "builtins")}
 
 
-def _receive(receiver: Connection, running: dict[Connection, ForkServerProcess],
-             what: str) -> Iterator:
-    """The next result. None where a process has ended as it should; InputError where it did not."""
+def _receive_result(receiver: Connection, running: dict[Connection, ForkServerProcess],
+                    what: str) -> Iterator:
+    """Yield the next result, or nothing if the process has ended normally.
+
+    Raises:
+        InputError: if it failed or died.
+    """
     try:
         result, error = receiver.recv()
-    except (EOFError, OSError):  # the latter in the middle of a result
+    except (EOFError, OSError):  # OSError in the middle of a result
         process = running.pop(receiver)
         process.join()
         if process.exitcode:
@@ -133,11 +150,11 @@ def _receive(receiver: Connection, running: dict[Connection, ForkServerProcess],
     yield result
 
 
-def _work(start: Callable, items: Sequence, shared: bool, sender: Connection) -> None:
+def _run_items(start: Callable, items: Sequence, shared: bool, sender: Connection) -> None:
     if shared:
-        one_thread_here()
+        limit_to_one_thread()
     parent = multiprocessing.parent_process()
-    with suppress(BrokenPipeError):  # nobody is there any more
+    with suppress(BrokenPipeError):  # the reader has ended
         try:
             work = start()
             for item in items:
@@ -148,51 +165,50 @@ def _work(start: Callable, items: Sequence, shared: bool, sender: Connection) ->
             sender.send((None, str(error)))
 
 
-def _asked(pipe: Connection, item: Any) -> Connection:
-    """The pipe, through which the item was sent."""
-    with suppress(OSError):  # of a process that has ended, which is said when it is heard
+def _send_item(pipe: Connection, item: Any) -> Connection:
+    """Send an item through a pipe and return the pipe."""
+    with suppress(OSError):  # the process has ended, which _receive_result reports
         pipe.send(item)
     return pipe
 
 
 def _serve(start: Callable, pipe: Connection) -> None:
-    one_thread_here()
-    signal.signal(signal.SIGTERM, _leave)
+    limit_to_one_thread()
+    signal.signal(signal.SIGTERM, _exit_once)
     results: SimpleQueue[Any] = SimpleQueue()
-    Thread(target=_send, args=(results, pipe), daemon=True).start()
+    Thread(target=_send_results, args=(results, pipe), daemon=True).start()
     work = start()
     while True:
         try:
             item = pipe.recv()
         except (EOFError, OSError):
-            return  # nobody is there any more
+            return  # the parent has ended
         try:
             results.put(ForkingPickler.dumps((work(item), None)))
         except InputError as error:
             results.put(ForkingPickler.dumps((None, str(error))))
 
 
-def _leave(*_: Any) -> None:
-    """The end of a process is asked for, perhaps twice: it gives back what it holds of the
-    system."""
+def _exit_once(*_: Any) -> None:
+    """Exit on the first SIGTERM, ignoring further ones, so that system resources are released."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     sys.exit()
 
 
-def _send(results: SimpleQueue[Any], pipe: Connection) -> None:
-    """Beside the work: the reader may be at something else for long."""
+def _send_results(results: SimpleQueue[Any], pipe: Connection) -> None:
+    """Send results in a thread, because the reader may be busy for long."""
     while True:
         try:
             pipe.send_bytes(results.get())
         except OSError:
-            os.kill(os.getpid(), signal.SIGTERM)  # nobody is there any more
+            os.kill(os.getpid(), signal.SIGTERM)  # the reader has ended
             return
 
 
 @contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """What is started in here never sees ctrl-C: the process that started it ends it."""
-    resource_tracker.ensure_running()  # or it would be started below, and lift the block
+def _block_interrupts() -> Iterator[None]:
+    """Start processes that never see ctrl-C: the process that started them ends them."""
+    resource_tracker.ensure_running()  # if it were started in the block, it would lift it
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -1,5 +1,4 @@
-"""Folders that are made in many steps: by one process at a time, and resumed only with identical
-settings."""
+"""Locks and comparison of settings, for folders that are written in many steps."""
 
 from __future__ import annotations
 
@@ -14,9 +13,12 @@ from typing import Any
 from lidar_perception.types import InputError
 
 
-def claim(descriptor: int, path: Path) -> str:
-    """Lock what is open for this process; "", or why the file system has no locks. InputError while
-    another process has it."""
+def lock_file(descriptor: int, path: Path) -> str:
+    """Lock an open file or folder; return "", or the reason if the file system has no locks.
+
+    Raises:
+        InputError: while another process holds the lock.
+    """
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -27,10 +29,12 @@ def claim(descriptor: int, path: Path) -> str:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Make the folder if need be, and keep a second process from writing into it. After an error,
-    folders that were made here and are still empty are removed."""
-    made = [each for each in (folder, *folder.parents) if not each.exists()]
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Create the folder if needed, and keep other processes from writing into it.
+
+    After an error, folders that were created here and are still empty are removed.
+    """
+    created = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -39,30 +43,32 @@ def locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise InputError(f"cannot make the folder {folder}: {error.strerror}") from None
     try:
-        claim(descriptor, folder)
+        lock_file(descriptor, folder)
         yield
     except BaseException:
         with suppress(OSError):
-            for each in made:
-                each.rmdir()
+            for path in created:
+                path.rmdir()
         raise
     finally:
         os.close(descriptor)
 
 
-def differences(before: dict[str, Any], asked: dict[str, Any]) -> list[str]:
-    """What is asked for otherwise than before: "frames 5, not 6". Dicts in dicts have dotted
-    names; what is only in `before` is passed over."""
+def find_differences(before: dict[str, Any], asked: dict[str, Any]) -> list[str]:
+    """Describe the settings that differ from before, as in "frames 5, not 6".
+
+    Nested dicts have dotted names; keys that only `before` has are ignored.
+    """
     found = []
     for key, value in asked.items():
         old = before.get(key)
         if isinstance(value, dict) and isinstance(old, dict):
-            found += [f"{key}.{line}" for line in differences(old, value)]
+            found += [f"{key}.{line}" for line in find_differences(old, value)]
         elif old != value:
             found.append(f"{key} {old!r}, not {value!r}")
     return found
 
 
-def digest(names: Iterable[str]) -> str:
-    """Short for many names, such as of frames: that of others, or in another order, is another."""
+def hash_names(names: Iterable[str]) -> str:
+    """Return a short hash of names, such as those of frames, in their order."""
     return hashlib.sha256("\n".join(names).encode()).hexdigest()[:12]

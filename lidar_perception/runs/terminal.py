@@ -1,4 +1,4 @@
-"""The terminal: results on standard output, progress and problems on standard error."""
+"""Terminal output: results on standard output, progress and problems on standard error."""
 
 from __future__ import annotations
 
@@ -28,109 +28,116 @@ from lidar_perception.types import InputWarning
 
 
 class Terminal(Console):
-    """A console whose text is no markup, as it holds names of files. Only a terminal breaks lines
-    of text, and tables are as wide as it; in a file or a pipe nothing is broken or cut."""
+    """Console without markup, because text may contain names of files.
 
-    def __init__(self, **more: Any) -> None:
-        super().__init__(highlight=False, markup=False, **more)
+    Lines are wrapped, and tables fitted to the width, on a terminal only; output to a file or a
+    pipe is never wrapped or cut.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(highlight=False, markup=False, **options)
 
     @property
     def options(self) -> ConsoleOptions:
-        return super().options if self.file.isatty() else super().options.update(max_width=WIDE)
+        options = super().options
+        return options if self.file.isatty() else options.update(max_width=MAX_WIDTH)
 
-    def print(self, *objects: Any, **how: Any) -> None:
-        text = all(isinstance(each, str | Text) for each in objects)
+    def print(self, *objects: Any, **options: Any) -> None:
+        is_text = all(isinstance(item, str | Text) for item in objects)
         if self.file.isatty():
-            super().print(*objects, **{"soft_wrap": text, **how})
+            super().print(*objects, **{"soft_wrap": is_text, **options})
             return
-        for each in [objects] if text else [[each] for each in objects]:
-            parts = _parts(each[0]) if isinstance(each[0], Table) else [each]
+        for group in [objects] if is_text else [[item] for item in objects]:
+            parts = _split_title(group[0]) if isinstance(group[0], Table) else [group]
             for part in parts:
-                super().print(*part, **{"soft_wrap": text, "crop": False, **how})
+                super().print(*part, **{"soft_wrap": is_text, "crop": False, **options})
 
 
-def _parts(table: Table) -> list[list[Any]]:
-    """The title, which rich would break at the width of the table, and the rest of a table."""
-    bare = copy.copy(table)
-    bare.title = None
-    return [[each] for each in (table.title, bare) if each is not None]
+def _split_title(table: Table) -> list[list[Any]]:
+    """Split a table from its title, which rich would wrap at the width of the table."""
+    untitled = copy.copy(table)
+    untitled.title = None
+    return [[part] for part in (table.title, untitled) if part is not None]
 
 
-WIDE = 100_000  # characters; wider than any table
+MAX_WIDTH = 100_000  # characters, wider than any table
 
 console = Terminal()
 errors = Terminal(stderr=True)
 
 @contextmanager
-def input_warnings_shown() -> Iterator[None]:
+def show_input_warnings() -> Iterator[None]:
     """Print each InputWarning once, as one line on standard error."""
     with warnings.catch_warnings():
         warnings.filterwarnings("once", category=InputWarning)
         show = warnings.showwarning
 
-        def print_line(message: Warning | str, category: type[Warning], *where: Any,
-                       **more: Any) -> None:
+        def print_line(message: Warning | str, category: type[Warning], *args: Any,
+                       **kwargs: Any) -> None:
             if issubclass(category, InputWarning):
                 errors.print(Text("warning", "yellow") + f": {message}")
             else:
-                show(message, category, *where, **more)
+                show(message, category, *args, **kwargs)
 
         warnings.showwarning = print_line
         yield
 
 
-EVERY = 15.0  # seconds between lines where there is no terminal
+LOG_INTERVAL_S = 15.0  # between lines of progress without a terminal
 
 
-def progress() -> Progress:
-    """Progress on standard error: in a terminal a bar with text, count, elapsed and remaining time;
-    elsewhere, as in a log, a line of the same every EVERY seconds."""
-    return (Progress if errors.is_terminal else _Lines)(
+def make_progress() -> Progress:
+    """Make a progress display on standard error.
+
+    It is a bar with text, count, elapsed and remaining time on a terminal, else a line with the
+    same information every LOG_INTERVAL_S seconds.
+    """
+    return (Progress if errors.is_terminal else _LineProgress)(
         TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
         TimeElapsedColumn(), TimeRemainingColumn(), console=errors, transient=True,
         auto_refresh=errors.is_terminal, disable=not errors.is_terminal)
 
 
-class _Lines(Progress):
-    """Progress that is written line by line; rich itself shows nothing, but knows the speed."""
+class _LineProgress(Progress):
+    """Progress written line by line; rich displays nothing, but computes the speed."""
 
-    said = 0.0
+    last_line = 0.0
 
     def add_task(self, *args: Any, **fields: Any) -> TaskID:
-        self.said = time.monotonic()
+        self.last_line = time.monotonic()
         return super().add_task(*args, **fields)
 
     def update(self, task_id: TaskID, **fields: Any) -> None:
         super().update(task_id, **fields)
-        self._say(task_id)
+        self._print_line(task_id)
 
     def advance(self, task_id: TaskID, advance: float = 1) -> None:
         super().advance(task_id, advance)
-        self._say(task_id)
+        self._print_line(task_id)
 
-    def _say(self, task_id: TaskID) -> None:
+    def _print_line(self, task_id: TaskID) -> None:
         now = time.monotonic()
-        if now - self.said < EVERY:
+        if now - self.last_line < LOG_INTERVAL_S:
             return
-        self.said = now
+        self.last_line = now
         task = next(task for task in self.tasks if task.id == task_id)
         if not task.visible:
             return
-        of = "" if task.total is None else f" of {task.total:.0f}"
+        total = "" if task.total is None else f" of {task.total:.0f}"
         left = task.time_remaining
-        errors.print(f"{task.description}: {task.completed:.0f}{of}"
-                     + ("" if left is None else f", {duration(left)} left"))
+        errors.print(f"{task.description}: {task.completed:.0f}{total}"
+                     + ("" if left is None else f", {format_duration(left)} left"))
 
 
-def looking_through(path: Path) -> Status:
-    """Shown in a terminal while all frames of a recording are found, for the times of all: of a bag
-    of hours that takes minutes."""
+def show_scanning(path: Path) -> Status:
+    """Show a status line while the times of all frames are read, which may take minutes for a bag.
+    """
     return errors.status(Text(f"looking through {path}"))
 
 
 @contextmanager
-def paused(bar: Progress) -> Iterator[None]:
-    """Without this bar, so that another one can be shown."""
+def pause_progress(bar: Progress) -> Iterator[None]:
+    """Hide a progress bar, so that another one can be shown."""
     if bar.disable:
         yield
         return
@@ -141,13 +148,13 @@ def paused(bar: Progress) -> Iterator[None]:
         bar.start()
 
 
-def track(items: Iterable, description: str, total: int) -> Iterator:
-    """The items, under the progress of `total` steps."""
-    with progress() as bar:
+def show_progress(items: Iterable, description: str, total: int) -> Iterator:
+    """Iterate over items and show the progress out of `total`."""
+    with make_progress() as bar:
         yield from bar.track(items, total=total, description=description)
 
 
-def duration(seconds: float) -> str:
-    """For people: 40 s, 12 min, 1.5 h."""
+def format_duration(seconds: float) -> str:
+    """Format a duration for reading: 40 s, 12 min, 1.5 h."""
     return (f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min" if seconds < 5400
             else f"{seconds / 3600:.1f} h")

@@ -1,38 +1,46 @@
-"""Threads that soon wait for work asleep, not spinning, where other programs need the cores too."""
+"""Settings of the threads of numerical libraries, for machines whose cores are shared."""
 
 from __future__ import annotations
 
 import os
 
-ONE_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# The standard; GNU's own: to look so often first, as the next layer follows within microseconds.
-WAIT_ASLEEP = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "1000"}
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# Of the OpenMP standard, and of GNU's OpenMP: spin this often first, because the next layer of a
+# network follows within microseconds.
+PASSIVE_WAITING = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "1000"}
 
 
-def wait_asleep() -> None:
-    """For OpenMP, which torch uses; it reads the environment when it is loaded, so call this
-    before. What the user has set stays. `fused` takes 102 ms on two free cores so, 120 where
-    threads sleep at once and 96 where they spin; beside two busy processes 230, 245 and 339.
-    NumPy's OpenBLAS cannot do that, and gains nothing with matrices of three columns: one
-    thread."""
+def use_passive_waiting() -> None:
+    """Make idle OpenMP threads sleep instead of spinning. Call this before torch is loaded.
+
+    The user's own settings in the environment are kept. `fused` takes 102 ms on two free cores,
+    120 ms if threads sleep at once and 96 ms if they spin; with two busy processes 230, 245 and
+    339 ms. NumPy's OpenBLAS has no such setting and gains nothing for matrices of three columns,
+    so it gets one thread.
+    """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if not WAIT_ASLEEP.keys() & os.environ.keys():
-        os.environ.update(WAIT_ASLEEP)
+    if not PASSIVE_WAITING.keys() & os.environ.keys():
+        os.environ.update(PASSIVE_WAITING)
 
 
-def one_thread_each() -> None:
-    """For processes that share few cores: libraries of linear algebra wait actively, too, so each
-    takes one thread, and torch's, which takes more where it is told to, wait asleep. Call this
-    before they are loaded. What the user has set stays."""
-    for variable in ONE_EACH:
+def default_to_one_thread() -> None:
+    """Set one thread per library as default, for processes that share few cores.
+
+    Threads of linear algebra libraries spin while they wait. torch may use more threads if asked
+    to; they sleep while idle. Call this before the libraries are loaded. The user's own settings in
+    the environment are kept.
+    """
+    for variable in THREAD_VARIABLES:
         os.environ.setdefault(variable, "1")
-    wait_asleep()
+    use_passive_waiting()
 
 
-def one_thread_here() -> None:
-    """Of each library in this process from now on, whether it is loaded yet or not, and whatever
-    the user has set for others. Two processes that prepare scenes make 35 a second so on two free
-    cores, and 8 where each has two threads for matrices."""
-    from threadpoolctl import threadpool_limits  # which commands need not wait for
-    os.environ.update(dict.fromkeys(ONE_EACH, "1"))
+def limit_to_one_thread() -> None:
+    """Limit each library in this process to one thread, loaded or not, against the user's settings.
+
+    Two processes that prepare scenes on two free cores make 35 scenes per second, but 8 with two
+    threads for matrices in each.
+    """
+    from threadpoolctl import threadpool_limits  # imported here to keep commands fast
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     threadpool_limits(1)

@@ -88,7 +88,7 @@ def by_files(folder: Path, recording: Recording
     run of `detect`; frames that the run skipped are skipped. With a folder a Start of
     scoring.run."""
     files = find_result_folder(folder)
-    skipped = journal.skipped_frames(files.parent)
+    skipped = journal.read_skipped_frames(files.parent)
 
     def measure(frame: Frame) -> Detected[GroundTruth] | None:
         truth, calibration = frame.truth(), frame.calibration()

@@ -25,8 +25,8 @@ from threadpoolctl import threadpool_limits
 
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.runs.journal import Journal
-from lidar_perception.runs.processes import in_processes
-from lidar_perception.runs.terminal import track
+from lidar_perception.runs.processes import run_in_processes
+from lidar_perception.runs.terminal import show_progress
 from lidar_perception.types import InputError, RunError
 
 Start = Callable[[Recording], Callable[[Frame], Any]]
@@ -59,7 +59,7 @@ def fill(report: Report, recording: Recording, start: Start, *, limit: int | Non
     count = min(len(recording), limit or len(recording))
     found = results(recording, start, range(count), jobs=jobs, dask=dask)
     with closing(found):
-        for _, result in track(found, title, count):
+        for _, result in show_progress(found, title, count):
             if isinstance(result, Skipped):
                 report.skipped.append(str(result))
             elif result is not None:
@@ -77,7 +77,7 @@ def complete(journal: Journal, recording: Recording, start: Start, names: Sequen
     missing = [i for i, name in enumerate(names) if name not in journal.lines]
     found = results(recording, start, missing, jobs=jobs, dask=dask)
     with closing(found):
-        for i, line in track(found, title, len(missing)):
+        for i, line in show_progress(found, title, len(missing)):
             journal.add(json.dumps({"frame": names[i], "skipped": str(line)})
                         if isinstance(line, Skipped) else line)
 
@@ -96,7 +96,7 @@ def results(recording: Recording, start: Start, numbers: Sequence[int] | None = 
         return in_order(_on_dask(dask, recording, start, numbers), numbers)
     if jobs > 1 and len(numbers) > 1:
         work = functools.partial(_worker, _reopening(recording), start)
-        return in_order(in_processes(work, numbers, jobs, "measured frames"), numbers)
+        return in_order(run_in_processes(work, numbers, jobs, "measured frames"), numbers)
     return _here(recording, start, numbers)
 
 

@@ -106,10 +106,10 @@ def _column(points: np.ndarray, indices: np.ndarray, names: Sequence[str],
 class Intensity(NamedTuple):
     """Intensities of all scans together.
 
-    full: the value of a full reflection, see intensity.full_scale, or the greatest value where that
-    is far beyond; sure: whether the values show it; whole: only whole numbers; zeros, bright:
-    shares of the returns with 0, and from RETROREFLECTOR of full on; quantiles (101,) and histogram
-    (51,) over 0 .. full.
+    full: the value of a full reflection, see intensity.infer_full_scale, or the greatest value
+    where that is far beyond; sure: whether the values show it; whole: only whole numbers; zeros,
+    bright: shares of the returns with 0, and from RETROREFLECTOR of full on; quantiles (101,) and
+    histogram (51,) over 0 .. full.
     """
 
     full: float

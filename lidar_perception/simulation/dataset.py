@@ -15,8 +15,8 @@ import numpy as np
 
 from lidar_perception.data import semantickitti
 from lidar_perception.data.kitti import write as write_kitti
-from lidar_perception.runs.folder import finish_frame
-from lidar_perception.runs.processes import in_processes
+from lidar_perception.runs.processes import run_in_processes
+from lidar_perception.runs.resumable_folder import finish_frame
 from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
 from lidar_perception.simulation.drive import SimulatedScan, longest_drive, scan_at
 from lidar_perception.simulation.scene import ANY, Scenes
@@ -95,7 +95,7 @@ def _semantic(folder: Path, plan: Plan, sequence: int, moment: int, scan: Simula
 def write_frames(folder: Path, plan: Plan, numbers: list[int], jobs: int) -> Generator[int]:
     """Write the frames of these numbers with so many processes; yields each when it is there.
     InputError, and the end of all processes, where one fails; they end with the iterator too."""
-    return in_processes(functools.partial(_writer, folder, plan), numbers, jobs, "wrote frames")
+    return run_in_processes(functools.partial(_writer, folder, plan), numbers, jobs, "wrote frames")
 
 
 def _writer(folder: Path, plan: Plan) -> Callable[[int], int]:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from lidar_perception.runs.files import read_text, short
+from lidar_perception.runs.files import read_text, shorten_error
 from lidar_perception.types import SENSOR_HEIGHT, InputError, did_you_mean
 
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where it was built
@@ -194,7 +194,7 @@ def sensor_from_file(path: str | Path) -> Sensor:
     try:
         content = yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
-        raise InputError(f"{path} is no YAML: {short(error)}") from None
+        raise InputError(f"{path} is no YAML: {shorten_error(error)}") from None
     if not isinstance(content, dict):
         raise InputError(f"{path} describes no sensor; {remedy}")
     values = {key: value for key, value in content.items() if key != "name"}

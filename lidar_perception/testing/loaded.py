@@ -4,9 +4,9 @@ from contextlib import suppress
 from importlib import import_module
 
 from lidar_perception.nodes import NODES, load_node_class
-from lidar_perception.runs.threads import one_thread_each
+from lidar_perception.runs.threads import default_to_one_thread
 
-one_thread_each()  # as nodes.main does
+default_to_one_thread()  # as nodes.main does
 for name in NODES:
     with suppress(ImportError):  # the node reports it when it starts
         load_node_class(name)

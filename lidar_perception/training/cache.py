@@ -15,8 +15,8 @@ import numpy as np
 
 from lidar_perception import __version__
 from lidar_perception.runs.files import write_bytes
-from lidar_perception.runs.processes import in_processes
-from lidar_perception.runs.terminal import track
+from lidar_perception.runs.processes import run_in_processes
+from lidar_perception.runs.terminal import show_progress
 from lidar_perception.types import InputError
 
 Content = TypeVar("Content")
@@ -118,8 +118,9 @@ def fill_cache(sources: Sequence[Any], numbers: Sequence[Sequence[int]], jobs: i
              for i in find_missing(source, some)]
     if not items:
         return
-    for _ in track(in_processes(partial(_make_keeper, tuple(sources)), items, jobs, title), title,
-                   len(items)):
+    for _ in show_progress(run_in_processes(partial(_make_keeper, tuple(sources)), items, jobs,
+                                            title), title,
+                           len(items)):
         pass
 
 

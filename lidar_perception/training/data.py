@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidar_perception.runs.processes import in_order
+from lidar_perception.runs.processes import run_in_order
 from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
 
@@ -144,8 +144,8 @@ def load_items(items: Any, numbers: Iterator[list[int]], jobs: int) -> Iterator[
     if jobs == 0:
         yield from map(_make_loader(items), numbers)
     else:
-        yield from in_order(partial(_make_loader, items), numbers, jobs, PREFETCH,
-                            "prepared scenes")
+        yield from run_in_order(partial(_make_loader, items), numbers, jobs, PREFETCH,
+                                "prepared scenes")
 
 
 def _make_loader(items: Any) -> Callable[[list[int]], list[Any]]:

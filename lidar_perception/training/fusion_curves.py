@@ -24,8 +24,8 @@ from lidar_perception.detectors.fused.model import probabilities
 from lidar_perception.detectors.fused.params import FusedDetectorParams, FusedParams
 from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.geometry import bev_iou, centre_distances
-from lidar_perception.runs.processes import in_processes
-from lidar_perception.runs.terminal import errors, track
+from lidar_perception.runs.processes import run_in_processes
+from lidar_perception.runs.terminal import errors, show_progress
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import sensor_named
@@ -207,9 +207,10 @@ def _match_boxes(boxes: np.ndarray, objects: np.ndarray, name: str) -> np.ndarra
 
 def simulate_samples(params: FusedDetectorParams, scenes: SimulatedScenes, jobs: int) -> Samples:
     """Return the proposals in all scans; the same for any number of processes."""
-    parts = sorted(track(in_processes(partial(_make_sampler, params, scenes), range(len(scenes)),
-                                      jobs, "detected in simulated scans"),
-                         "simulating and detecting", len(scenes)), key=lambda part: part[0])
+    parts = sorted(show_progress(run_in_processes(partial(_make_sampler, params, scenes),
+                                                  range(len(scenes)),
+                                                  jobs, "detected in simulated scans"),
+                                 "simulating and detecting", len(scenes)), key=lambda part: part[0])
     return Samples.concatenate([part for _, part in parts])
 
 

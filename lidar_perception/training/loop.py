@@ -21,8 +21,8 @@ import numpy as np
 import torch
 
 from lidar_perception.runs.files import make_folder, write_bytes
-from lidar_perception.runs.resuming import differences
-from lidar_perception.runs.terminal import errors, paused, progress
+from lidar_perception.runs.resuming import find_differences
+from lidar_perception.runs.terminal import errors, make_progress, pause_progress
 from lidar_perception.training.distributed import (
     find_minimum,
     get_rank,
@@ -75,7 +75,7 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
     begun = time.monotonic() - run.progress.seconds
     pace, warned = Pace(until, run.validate_steps, validation), False
     try:
-        with _catch_signals() as stop, progress() as bar:
+        with _catch_signals() as stop, make_progress() as bar:
             line = bar.add_task("training", total=run.steps, completed=int(run.position),
                                 visible=get_rank() == 0)
             batches = iter(task.batches(run.progress.step))
@@ -89,7 +89,7 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
                     run.done or not is_true_anywhere(pace.is_over(2), device))
                 if due or (run.progress.late and run.progress.step > run.progress.validated):
                     _save_state(path, run)  # as validation takes a while
-                    with pace.time_validation(), paused(bar):
+                    with pace.time_validation(), pause_progress(bar):
                         _validate(run, log)
                     _save_state(path, run)
                 if run.done or run.progress.late:
@@ -223,7 +223,7 @@ def _read_state(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
     except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"cannot read {path}: {reason}; remove it to start again") from None
-    if different := differences(before, settings):
+    if different := find_differences(before, settings):
         raise InputError(f"{path} is of a run with {'; '.join(different[:3])}; resume it with the "
                          "same settings, or give another --out")
     return state

@@ -14,8 +14,8 @@ import torch
 
 from lidar_perception.detectors.checkpoint import HEIGHT_APART
 from lidar_perception.param_fields import with_values
-from lidar_perception.runs.machine import cores
-from lidar_perception.runs.terminal import duration, errors
+from lidar_perception.runs.machine import count_cores
+from lidar_perception.runs.terminal import errors, format_duration
 from lidar_perception.simulation.sensor import Sensor
 from lidar_perception.training.data import Item, SceneReader
 from lidar_perception.training.distributed import get_world_size
@@ -65,7 +65,7 @@ class Planner:
                     self.trainer.max_cuts(params))
         given = Plan(params.data.scans, params.data.val_scans, 0, params.steps,
                      params.validate_steps, bool(self.trainer.reduced_range(params)))
-        plan = fit_plan(self.request.budget or DEFAULT_BUDGET_H, cores(), speed, data, given,
+        plan = fit_plan(self.request.budget or DEFAULT_BUDGET_H, count_cores(), speed, data, given,
                         params.epochs)
         if params.validate_epochs and not params.validate_steps:
             epoch = max(1, round((plan.scans + data.recorded) / data.batch))
@@ -86,7 +86,7 @@ class Planner:
         """
         _, plan, speed, data = run
         passed = time.monotonic() - begun
-        slowdown = max(1.0, (passed - STARTUP_S) / preparation_duration(plan, cores(), speed))
+        slowdown = max(1.0, (passed - STARTUP_S) / preparation_duration(plan, count_cores(), speed))
 
         def seconds_left() -> float:
             return begun + 3600 * hours - time.monotonic()
@@ -97,8 +97,8 @@ class Planner:
         step_slowdown = now.step / speed.step if plan.part else now.whole / speed.whole
         shortened = shorten_plan(plan, seconds_left(), max(1.0, step_slowdown), speed, data)
         if shortened != plan:
-            errors.print(f"the preparation took {duration(passed)}, {slowdown:.1f} times as long "
-                         f"as planned, and a step takes {step_slowdown:.1f} times as long: "
+            errors.print(f"the preparation took {format_duration(passed)}, {slowdown:.1f} times "
+                         f"as long as planned, and a step takes {step_slowdown:.1f} times as long: "
                          f"{shortened.steps} steps instead of {plan.steps}")
         return run._replace(plan=shortened)
 
@@ -132,12 +132,13 @@ class Planner:
                      f"{region}, validated {often} on "
                      f"{plan.val_scans + data.val_recorded} other scenes")
         steps, validations = training_durations(plan, speed, data)
-        cutting = preparation_duration(replace(plan, scans=0, val_scans=0), cores(), speed)
-        parts = {"simulating": preparation_duration(plan, cores(), speed) - cutting,
+        cutting = preparation_duration(replace(plan, scans=0, val_scans=0), count_cores(), speed)
+        parts = {"simulating": preparation_duration(plan, count_cores(), speed) - cutting,
                  self.trainer.cutting: cutting, "steps": steps, "validation": validations}
-        errors.print(f"about {duration(sum(parts.values()))} on {cores()} cores as busy as now, "
-                     f"torch with {torch.get_num_threads()} threads: "
-                     + ", ".join(f"{name} {duration(value)}" for name, value in parts.items()))
+        errors.print(f"about {format_duration(sum(parts.values()))} on {count_cores()} cores as "
+                     f"busy as now, torch with {torch.get_num_threads()} threads: "
+                     + ", ".join(f"{name} {format_duration(value)}"
+                                 for name, value in parts.items()))
         errors.print(f"cache: {params.data.cache}; an interrupted run continues with --resume")
 
 

@@ -9,9 +9,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lidar_perception.runs.files import check_folder, read_text, remove_temporaries, write_text
-from lidar_perception.runs.resuming import differences, locked
-from lidar_perception.runs.stopping import terminated_as_interrupted
+from lidar_perception.runs.files import (
+    check_writable_folder,
+    read_text,
+    remove_temporaries,
+    write_text,
+)
+from lidar_perception.runs.interrupts import interrupt_on_sigterm
+from lidar_perception.runs.resuming import find_differences, lock_folder
 from lidar_perception.training.distributed import get_rank
 from lidar_perception.training.plan import Data, Plan, Speed
 from lidar_perception.types import InputError
@@ -69,7 +74,7 @@ class RunDirectory:
         self._require_absent(self.state_file, resume)
 
     def _require_absent(self, file: Path, resume: bool) -> None:
-        check_folder(self.path)
+        check_writable_folder(self.path)
         if file.exists() and not resume:
             raise InputError(f"{self.path} holds a training run already; give --resume to resume "
                              "it, or another --out")
@@ -84,7 +89,7 @@ class RunDirectory:
         if get_rank() > 0:
             yield
             return
-        with locked(self.path), terminated_as_interrupted():
+        with lock_folder(self.path), interrupt_on_sigterm():
             remove_temporaries(self.path, *WRITTEN)
             for folder in (self.path / SCANS, *(self.path / SCANS).glob("*/")):
                 remove_temporaries(folder, "*.npz")
@@ -107,7 +112,7 @@ class RunDirectory:
             content = json.loads(text)
             run = PlannedRun(content["asked"], Plan(**content["plan"]), Speed(**content["speed"]),
                              Data(**content["data"]))
-            different = differences(run.settings, json.loads(json.dumps(settings)))
+            different = find_differences(run.settings, json.loads(json.dumps(settings)))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"cannot read {self.plan_file}: {error!r}; give another --out"
                              ) from None

@@ -15,7 +15,7 @@ from lidar_perception.detectors.checkpoint import network_of
 from lidar_perception.detectors.devices import chosen_device
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.files import make_folder
-from lidar_perception.runs.resuming import digest
+from lidar_perception.runs.resuming import hash_names
 from lidar_perception.runs.terminal import errors
 from lidar_perception.simulation.sensor import Sensor, sensor_named
 from lidar_perception.training.cache import fill_cache
@@ -166,7 +166,7 @@ def _collect_settings(request: TrainingRequest, params: Any, sensor: Sensor,
 
 
 def _digest_names(sources: Sequence[Any]) -> list[str]:
-    return [digest(source.names) for source in sources if isinstance(source, RecordedScenes)]
+    return [hash_names(source.names) for source in sources if isinstance(source, RecordedScenes)]
 
 
 def _describe_sensor(params: Any, sensor: Sensor, sources: Sequence[Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from lidar_perception.detectors.devices import number_format
-from lidar_perception.runs.machine import cores
+from lidar_perception.runs.machine import count_cores
 from lidar_perception.training.data import Item, SceneReader
 from lidar_perception.training.params import LoopParams
 from lidar_perception.types import InputError
@@ -99,4 +99,4 @@ def measure_step(module: nn.Module, loss: Callable, prepare: Callable[[], Sequen
     module.train()
     step()
     duration, _ = measure_duration(step)
-    return duration + preparation / len(samples) * params.batch / cores()
+    return duration + preparation / len(samples) * params.batch / count_cores()

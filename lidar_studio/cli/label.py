@@ -21,7 +21,7 @@ from lidar_perception.cli.data import (
 )
 from lidar_perception.cli.options import detector_options
 from lidar_perception.detectors.open import DetectorChoice
-from lidar_perception.runs.terminal import console, errors, looking_through, progress
+from lidar_perception.runs.terminal import console, errors, make_progress, show_scanning
 from lidar_perception.types import InputError
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def label(data: Path, sequence: str | None, out: Path | None, detector: Detector
     if simulate_annotator:
         write_json(json_file, _simulated(recording, sequence, detector))
         return
-    with looking_through(data):
+    with show_scanning(data):
         drive = one_drive(recording, sequence)
     if target is None:
         require_clouds(drive)
@@ -141,7 +141,7 @@ def _simulated(recording: Recording, sequence: str | None,
 
     recording.require(BOXES, "label --simulate-annotator")
     found: dict[str, Any] = {}
-    with looking_through(recording.path):
+    with show_scanning(recording.path):
         names = dict.fromkeys(frame.sequence for frame in recording)
     for name in names if sequence is None else [sequence]:
         drive = one_drive(recording, name)
@@ -162,6 +162,6 @@ def _simulated(recording: Recording, sequence: str | None,
 
 
 def _propose(drive: Drive, made: Session) -> None:
-    with progress() as bar:
+    with make_progress() as bar:
         task = bar.add_task(f"{drive.name}: looking for proposals", total=len(drive.frames))
         made.propose(told=lambda count: bar.update(task, completed=count))

@@ -14,7 +14,7 @@ from lidar_perception.cli.command import Choice, Command
 from lidar_perception.cli.data import browser_option, data_argument, opened, port_option
 from lidar_perception.cli.options import detectors_options
 from lidar_perception.detectors.open import DetectorChoice
-from lidar_perception.runs.terminal import console, looking_through
+from lidar_perception.runs.terminal import console, show_scanning
 from lidar_perception.types import InputError
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def _served(path: Path, detectors: tuple[DetectorChoice, ...], results: tuple[Pa
     a_bag = path.exists() and is_layout(path)
     recording = (opened(path, points=points or named or shown.points_topic(path)) if a_bag
                  else opened(path))
-    with looking_through(path):
+    with show_scanning(path):
         drive = one_drive(recording, sequence)
     require_clouds(drive)
     found = shown.Results()

@@ -141,7 +141,7 @@ def test_error_of_a_bad_template_names_the_file(tmp_path, text):
 
 def test_a_pipe_as_template_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe.json")
-    with pytest.raises(InputError, match=r"pipe\.json is no file"):
+    with pytest.raises(InputError, match=r"pipe\.json is not a regular file"):
         load_seed(tmp_path / "pipe.json")
 
 

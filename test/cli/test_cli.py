@@ -457,7 +457,7 @@ def test_settings_of_a_detector_take_effect_and_win():
 
 def test_a_pipe_is_no_parameter_file_and_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(InputError, match="is no file"):
+    with pytest.raises(InputError, match="is not a regular file"):
         read_config(tmp_path / "pipe", PipelineParams())
 
 

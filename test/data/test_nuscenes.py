@@ -263,7 +263,7 @@ def test_invalid_tables_are_reported(changed, change, words):
 
 
 def test_invalid_file_name_is_reported(changed):
-    with pytest.raises(InputError, match=r"x00b' is no name of a file"):
+    with pytest.raises(InputError, match=r"x00b' is not a valid file name"):
         for frame in open_nuscenes(changed(lambda tables: [
                 row.update(filename="a\0b") for row in tables["sample_data"]])):
             frame.load()

@@ -264,5 +264,5 @@ def test_named_pipe_is_rejected_without_waiting(tmp_path):
         os.mkfifo(tmp_path / path)
     for read in (lambda: open_recording(tmp_path / "bag"), lambda: Bag(tmp_path / "bag/bag.mcap"),
                  lambda: read_velodyne(tmp_path / "pipe.bin")):
-        with pytest.raises(InputError, match="is no file"):
+        with pytest.raises(InputError, match="is not a regular file"):
             read()

@@ -117,7 +117,7 @@ def test_a_killed_run_of_two_processes_goes_on_where_it_was(crowds, whole, tmp_p
 @pytest.mark.parametrize("cut", [1, 2, 40])
 def test_a_cut_last_line_is_dropped_and_its_frame_measured_again(few, tmp_path, cut):
     expected = runner.run(SMALL, open_recording(few), tmp_path / "out")
-    path = tmp_path / "out" / journal.NAME
+    path = tmp_path / "out" / journal.JOURNAL_NAME
     bytes_before = path.read_bytes()
     path.write_bytes(bytes_before[:-cut])
     assert runner.run(SMALL, open_recording(few), tmp_path / "out") == expected
@@ -158,14 +158,14 @@ def test_a_frame_that_was_skipped_is_tried_again(few, tmp_path):
 def test_another_plan_is_an_error_that_names_what_differs(few, tmp_path):
     out = tmp_path / "out"
     runner.run(small(limits=(1, 2), deep={"a": 1, "b": 2}), open_recording(few), out)
-    before = (out / journal.NAME).read_bytes()
+    before = (out / journal.JOURNAL_NAME).read_bytes()
     with pytest.raises(InputError, match=r"settings.deep.b 2, not 3; .*--force") as error:
         runner.run(small(limits=(1, 2), deep={"a": 1, "b": 3}), open_recording(few), out)
     assert "deep.a" not in str(error.value) and "limits" not in str(error.value)
     other = object_folder(tmp_path / "other", count=4)
     with pytest.raises(InputError, match=r"data '.*few', not '.*other'; frames 5, not 4"):
         runner.run(small(limits=(1, 2), deep={"a": 1, "b": 2}), open_recording(other), out)
-    assert (out / journal.NAME).read_bytes() == before
+    assert (out / journal.JOURNAL_NAME).read_bytes() == before
     runner.run(SMALL, open_recording(other), out, force=True)
     assert len(runner.run(SMALL, open_recording(other), out)) == 4
 
@@ -189,21 +189,21 @@ def test_force_begins_anew_and_leaves_no_old_table_and_what_is_not_the_runs(whol
     out = shutil.copytree(whole, tmp_path / "out")
     theirs = {write(out / "tables/mine.csv", "me"), write(out / "figures/photo.png", "me")}
     records = runner.run(SMALL, open_recording(few), out, force=True)
-    assert {*out.rglob("*.*")} == {out / journal.NAME, *theirs}
+    assert {*out.rglob("*.*")} == {out / journal.JOURNAL_NAME, *theirs}
     write_report(out, SMALL, records, points_table(records), {})
     assert {p.stem for p in out.rglob("*.csv")} == {"points", "mine"}
 
 
 @pytest.mark.parametrize("first", ["", "{", "[]", '{"frame": "000000"}'])
 def test_a_journal_without_a_plan_is_not_gone_on_with(few, tmp_path, first):
-    write(tmp_path / "out" / journal.NAME, first + "\n")
+    write(tmp_path / "out" / journal.JOURNAL_NAME, first + "\n")
     with pytest.raises(InputError, match=r"cannot read .*--force"):
         runner.run(SMALL, open_recording(few), tmp_path / "out")
     assert len(runner.run(SMALL, open_recording(few), tmp_path / "out", force=True)) == 5
 
 
 def test_two_runs_do_not_write_one_folder(few, tmp_path):
-    with (journal.journal(tmp_path / "out", {}) as _,
+    with (journal.open_journal(tmp_path / "out", {}) as _,
           pytest.raises(InputError, match="another process")):
         runner.run(SMALL, open_recording(few), tmp_path / "out", force=True)
 
@@ -336,7 +336,7 @@ def test_every_table_and_figure_is_in_every_format(whole):
         picture = whole / f"figures/{figure['name']}.png"
         assert picture.read_bytes().startswith(b"\x89PNG")
         assert figure["title"] in page and f"(figures/{figure['name']}.png)" in markdown
-    assert {p for p in whole.rglob("*") if p.is_file()} == {whole / journal.NAME,
+    assert {p for p in whole.rglob("*") if p.is_file()} == {whole / journal.JOURNAL_NAME,
                                                              *report_files.written(whole)}
 
 

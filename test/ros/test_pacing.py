@@ -14,7 +14,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from lidar_perception.nodes.graph import chosen_clouds
 from lidar_perception.nodes.replay import pacing
-from lidar_perception.runs.threads import WAIT_ASLEEP
+from lidar_perception.runs.threads import PASSIVE_WAITING
 from lidar_perception.types import InputError
 
 
@@ -90,10 +90,11 @@ def test_the_clouds_of_a_bag_are_found_or_those_it_has_are_named():
 def test_threads_wait_asleep_unless_the_user_says_otherwise(own):
     """The command sets it before torch is loaded, which reads it then."""
     program = ("import atexit, os, sys; sys.argv[1:] = ['--version']; "
-               f"atexit.register(lambda: print([os.environ.get(k) for k in {list(WAIT_ASLEEP)}], "
+               "atexit.register(lambda: print([os.environ.get(k) for k in "
+               f"{list(PASSIVE_WAITING)}], "
                "'torch' in sys.modules)); from lidar_perception.cli.main import main; main()")
-    environment = {k: v for k, v in os.environ.items() if k not in WAIT_ASLEEP} | own
+    environment = {k: v for k, v in os.environ.items() if k not in PASSIVE_WAITING} | own
     said = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True,
                           text=True).stdout.splitlines()[-1]
-    expected = own or WAIT_ASLEEP
-    assert said == f"{[expected.get(k) for k in WAIT_ASLEEP]} False"
+    expected = own or PASSIVE_WAITING
+    assert said == f"{[expected.get(k) for k in PASSIVE_WAITING]} False"

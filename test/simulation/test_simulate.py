@@ -20,7 +20,7 @@ from simulate_samples import arguments, content, run
 
 from lidar_perception.cli.simulate import simulate
 from lidar_perception.data.open import open_recording
-from lidar_perception.runs import folder as folder_module
+from lidar_perception.runs import resumable_folder
 from lidar_perception.simulation import dataset
 from lidar_perception.simulation.dataset import LAYOUTS
 from lidar_perception.simulation.drive import scan_at
@@ -171,7 +171,7 @@ def test_what_is_there_is_not_touched_without_a_word(made, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/letter.txt").write_text("dear")
     for flag in ("--resume", "--force"):
-        with pytest.raises(InputError, match="no simulated data set"):
+        with pytest.raises(InputError, match="not a simulated data set"):
             run(tmp_path / "mine", "kitti", 2, 1, flag)
     assert content(tmp_path / "mine") == {"letter.txt": b"dear"}
     with pytest.raises(InputError, match="is a file"):
@@ -182,8 +182,8 @@ def test_what_is_there_is_not_touched_without_a_word(made, tmp_path):
         run(out, "kitti", 2, 1, "--force")
     assert content(out) == before | {"notes.txt": b"dear"}
     notes.unlink()
-    (out / folder_module.RECORD).unlink()  # stopped while --force removed what was there
-    (out / folder_module.MARK).write_text("{}")
+    (out / resumable_folder.RECORD_NAME).unlink()  # stopped while --force removed what was there
+    (out / resumable_folder.INCOMPLETE_NAME).write_text("{}")
     with pytest.raises(InputError, match="start again with --force"):
         run(out, "kitti", 2, 1, "--resume")
     assert run(out, "semantickitti", 5, 1, "--streets-of", 2, "--force").exit_code == 0

@@ -55,12 +55,12 @@ def command(*arguments):
 
 def untimed(folder):
     """Records of a folder without their times, in its order."""
-    head, *lines = (folder / journal.NAME).read_text().splitlines()
+    head, *lines = (folder / journal.JOURNAL_NAME).read_text().splitlines()
     assert "plan" in json.loads(head)
     records = [json.loads(line) for line in lines]
     return [{k: v for k, v in record.items() if k != "ms"} for record in records]
 
 
 def lines_of(folder):
-    path = folder / journal.NAME
+    path = folder / journal.JOURNAL_NAME
     return path.read_text().splitlines() if path.exists() else []

@@ -19,7 +19,7 @@ from lidar_perception.detectors.checkpoint import read_header, save_header
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.runs import terminal
-from lidar_perception.runs.resuming import locked
+from lidar_perception.runs.resuming import lock_folder
 from lidar_perception.training import planning, start
 from lidar_perception.training.run_directory import RUN, STATE, RunDirectory
 from lidar_perception.types import SENSOR_HEIGHT, InputError
@@ -90,7 +90,7 @@ def refuse(tmp_path: Path, *more: str) -> str:
 
 
 def test_run_directory_is_locked(tmp_path):
-    with locked(tmp_path / "run"):
+    with lock_folder(tmp_path / "run"):
         assert "another process" in refuse(tmp_path, "--resume", "--sensor", SENSOR)
 
 
@@ -226,8 +226,8 @@ def test_run_is_not_resumed_with_changed_split_or_weights(tmp_path, monkeypatch)
 
 
 def test_progress_without_terminal_prints_lines(monkeypatch, capsys):
-    monkeypatch.setattr(terminal, "EVERY", 0.0)
-    assert list(terminal.track(iter("abc"), "cutting", 3)) == ["a", "b", "c"]
+    monkeypatch.setattr(terminal, "LOG_INTERVAL_S", 0.0)
+    assert list(terminal.show_progress(iter("abc"), "cutting", 3)) == ["a", "b", "c"]
     lines = capsys.readouterr().err.splitlines()
     assert [line.partition(",")[0] for line in lines] == [
         f"cutting: {i} of 3" for i in (1, 2, 3)]

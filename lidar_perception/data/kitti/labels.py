@@ -12,7 +12,7 @@ import numpy as np
 
 from lidar_perception.classes import class_name
 from lidar_perception.geometry import wrap_angle
-from lidar_perception.runs.files import read_text, regular
+from lidar_perception.runs.files import check_regular, read_text
 from lidar_perception.types import CLASSES, LARGEST, GroundTruth, InputError, class_ids
 
 # Columns of a label file after the class, in order; they are kept in GroundTruth.extras.
@@ -197,7 +197,7 @@ def read_tracklets(path: Path) -> dict[int, GroundTruth]:
     """
     frames: dict[int, tuple[list, list]] = {}
     try:
-        tracklets = _find_child(ElementTree.parse(regular(path)).getroot(), "tracklets")
+        tracklets = _find_child(ElementTree.parse(check_regular(path)).getroot(), "tracklets")
         for track, item in enumerate(tracklets.iterfind("item")):
             text = _find_text(item, "objectType").strip()
             h, w, length = (float(_find_text(item, k)) for k in "hwl")

@@ -31,7 +31,7 @@ DECIMALS = 6  # with fewer, the order of weak scores and overlaps would change
 
 def find_result_folder(folder: Path) -> Path:
     """Return the folder of result files: `folder`, or its kitti/ if it is a run of `detect`."""
-    return folder / FOLDER if (folder / journal.NAME).is_file() and (
+    return folder / FOLDER if (folder / journal.JOURNAL_NAME).is_file() and (
         folder / FOLDER).is_dir() else folder
 
 

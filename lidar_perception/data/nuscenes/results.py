@@ -17,7 +17,7 @@ from lidar_perception.data.nuscenes.boxes import (
     are_valid_rotations,
     to_global_boxes,
 )
-from lidar_perception.runs.files import regular, short, write_text
+from lidar_perception.runs.files import check_regular, shorten_error, write_text
 from lidar_perception.types import CLASSES, LARGEST, Detections, InputError
 
 MAX_BOXES = 500    # per frame
@@ -83,11 +83,12 @@ def read_results(path: Path, frames: Sequence[Frame]) -> dict[str, GlobalBoxes]:
     Raises InputError that names a missing frame or an invalid box.
     """
     try:
-        content = json.loads(regular(path).read_text(encoding="utf-8-sig"))
+        content = json.loads(check_regular(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"cannot read the results {path}: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not a JSON file ({short(error)}); write the results again"
+        raise InputError(f"{path} is not a JSON file ({shorten_error(error)}); write the results "
+                         "again"
                          ) from None
     results = content.get("results") if isinstance(content, dict) else None
     if not isinstance(results, dict):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data.nuscenes.boxes import are_valid_rotations
-from lidar_perception.runs.files import regular, short
+from lidar_perception.runs.files import check_regular, shorten_error
 from lidar_perception.types import LARGEST, InputError
 
 CHUNK_SIZE = 2**22   # characters read at a time; rows are shorter
@@ -70,7 +70,7 @@ class Tables:
     def _decode_rows(self, table: str) -> Iterator[Any]:
         path, decode = self.path(table), json.JSONDecoder().raw_decode
         try:
-            with open(regular(path), encoding="utf-8-sig") as stream:
+            with open(check_regular(path), encoding="utf-8-sig") as stream:
                 text = stream.read(CHUNK_SIZE).lstrip()
                 if text[:1] != "[":
                     raise InputError(f"{path} is not a list of rows; download the tables of "
@@ -95,7 +95,7 @@ class Tables:
             raise InputError(f"cannot read the table {path}: {error.strerror}; unpack the "
                              f"metadata of {self.version} there") from None
         except (UnicodeDecodeError, RecursionError) as error:
-            raise InputError(f"{path} is damaged ({short(error)}); download the tables of "
+            raise InputError(f"{path} is damaged ({shorten_error(error)}); download the tables of "
                              f"{self.version} again") from None
 
     def numbers(self, table: str, field: str, values: list, width: int) -> np.ndarray:

@@ -24,7 +24,7 @@ from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file as proposer_file
 from lidar_perception.detectors.weights_file import existing
-from lidar_perception.runs.files import read_text, short, write_text
+from lidar_perception.runs.files import read_text, shorten_error, write_text
 from lidar_perception.types import InputError
 
 PACKAGE = Path(__file__).with_name("fusion.json")
@@ -119,7 +119,8 @@ def read_fusion(path: Path) -> Fusion:
             RecursionError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path} is no file of `lidar-perception train fused` ({short(error)})"
+        raise InputError(f"{path} is no file of `lidar-perception train fused` "
+                         f"({shorten_error(error)})"
                          ) from None
     proposer, classifier = (path.parent / file if file else default
                             for file, default in zip(files, _shipped()))

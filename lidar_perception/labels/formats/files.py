@@ -11,7 +11,7 @@ from typing import Any
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.labels.drive_labels import NO_TRACK, FrameLabels
-from lidar_perception.runs.files import check_free, read_text, whole_folder, write_text
+from lidar_perception.runs.files import check_unused, read_text, write_folder, write_text
 from lidar_perception.types import InputError
 
 MAX_BYTES = 2**30  # of a file of labels
@@ -54,10 +54,10 @@ def write_drives(out: Path, frames: Sequence[Frame], suffix: str, force: bool,
     drives = sequences_of(frames)
     if out.suffix == suffix:
         ((drive, file),) = drive_files(out, frames, suffix).items()
-        check_free(out, force)
+        check_unused(out, force)
         write(file, drive, drives[drive])
         return
-    with whole_folder(out, force) as folder:
+    with write_folder(out, force) as folder:
         for drive, file in drive_files(folder, frames, suffix).items():
             write(file, drive, drives[drive])
 

@@ -11,7 +11,7 @@ from lidar_perception.data.kitti.labels import format_label, parse_lines
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
 from lidar_perception.labels.formats.files import check_all_known, frame_files
 from lidar_perception.labels.formats.kitti_lines import frame_labels, label_folder, lines_of
-from lidar_perception.runs.files import whole_folder, write_bytes
+from lidar_perception.runs.files import write_bytes, write_folder
 
 # KITTI's files have two decimals; what was computed has up to six.
 ZEROS = re.compile(r"(\.\d\d\d*?)0+(?=\s|$)")
@@ -30,7 +30,7 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
     """out: a folder, for a file of each frame."""
-    with whole_folder(out, force) as folder:
+    with write_folder(out, force) as folder:
         for each, frame, file in zip(labels.frames, frames, frame_files(folder, frames, ".txt")):
             write_bytes(file, text_of_frame(each, frame).encode())
 

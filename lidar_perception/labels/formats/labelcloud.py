@@ -38,7 +38,7 @@ from lidar_perception.labels.formats.files import (
     read_json,
     write_json,
 )
-from lidar_perception.runs.files import whole_folder
+from lidar_perception.runs.files import write_folder
 from msg_utils.markers import COLORS, OTHER_COLOR
 
 ROOT, CLASSES_FILE, SUFFIX = "labelcloud", "_classes.json", ".json"
@@ -106,7 +106,7 @@ def _write(kind: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
     """out: a folder, for FRAME.json of each frame and _classes.json."""
     names = sorted({name for each in labels.frames for name in each.class_names})
     heads = labels.extra.get(ROOT, {})
-    with whole_folder(out, force) as folder:
+    with write_folder(out, force) as folder:
         for each, frame, file in zip(labels.frames, frames, frame_files(folder, frames, SUFFIX)):
             cloud = frame.points or Path(f"{file.stem}.pcd")
             write_json(file, {"folder": cloud.parent.name, "filename": cloud.name,

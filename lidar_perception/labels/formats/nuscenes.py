@@ -45,7 +45,7 @@ from lidar_perception.labels.formats.files import (
     track_names,
     track_numbers,
 )
-from lidar_perception.runs.files import check_free, write_text
+from lidar_perception.runs.files import check_unused, write_text
 from lidar_perception.types import InputError
 
 ROOT = "nuscenes"
@@ -145,7 +145,7 @@ def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
            force: bool = False) -> None:
     """out: one JSON file. Velocities that the labels do not have are those of the tracks, from
     frame to frame; NaN, which nuscenes-devkit reads, where there is none."""
-    check_free(out, force)
+    check_unused(out, force)
     poses = {i: _pose(frame) for i, frame in enumerate(frames) if len(labels.frames[i])}
     speeds, names = _velocities(labels, frames, poses), track_names(labels.frames, "tracking_id")
     results = {}

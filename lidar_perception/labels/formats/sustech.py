@@ -34,7 +34,7 @@ from lidar_perception.labels.formats.files import (
     track_numbers,
     write_json,
 )
-from lidar_perception.runs.files import whole_folder
+from lidar_perception.runs.files import write_folder
 
 SUFFIX = ".json"
 TILTED = "sustech_tilted"
@@ -85,7 +85,7 @@ def _rows(content: list[dict[str, Any]], ids: dict[str, int]) -> list[Row]:
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
     """out: a folder, for FRAME.json of each frame."""
     names = track_names(labels.frames, "obj_id")
-    with whole_folder(out, force) as folder:
+    with write_folder(out, force) as folder:
         for each, file in zip(labels.frames, frame_files(folder, frames, SUFFIX)):
             write_json(file, [_object(each, k, names) for k in range(len(each))], 1)
 

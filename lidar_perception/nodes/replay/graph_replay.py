@@ -27,7 +27,7 @@ from lidar_perception.nodes.graph import (
 )
 from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.param_fields import flatten
-from lidar_perception.runs.terminal import errors, progress
+from lidar_perception.runs.terminal import errors, make_progress
 from lidar_perception.tracking.ego import recorded_source
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
@@ -90,7 +90,7 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
                                            "wait_for": rules,
                                            "follow": [] if real_time else [stages[FINAL]],
                                            "ahead": AHEAD})
-        with progress() as bar:
+        with make_progress() as bar:
             task = bar.add_task("replaying", total=clouds)
             before = -1
 

@@ -28,7 +28,7 @@ from lidar_perception.detectors.pointnet.predict import found, outputs_of, predi
 from lidar_perception.detectors.view import as_found
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.params import SensorPoseParams
-from lidar_perception.runs.terminal import track
+from lidar_perception.runs.terminal import show_progress
 from lidar_perception.scoring.detections import Detected
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.augment import add_range_noise, vary_thing
@@ -238,7 +238,7 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
             for s in scenes if len(s.clusters)])
         calibrate(network, logits, torch.from_numpy(labels))
     report, predictions = DetectionReport(), []
-    for scene in track(scenes, "validating", len(scenes)):
+    for scene in show_progress(scenes, "validating", len(scenes)):
         predictions.append(predict(network, scene.clusters))
         boxes = found(predictions[-1], config, [MIN_SCORE] * len(config.classes))
         boxes = as_found(boxes, SensorPoseParams(height=scene.height))

@@ -43,7 +43,7 @@ from lidar_perception.detectors.pointpillars.targets import (
 from lidar_perception.detectors.view import visible
 from lidar_perception.geometry import is_within
 from lidar_perception.ground.params import SensorPoseParams
-from lidar_perception.runs.terminal import track
+from lidar_perception.runs.terminal import show_progress
 from lidar_perception.scoring.detections import Detected, detected
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.scoring.kitti.report import DetectionReport
@@ -249,7 +249,7 @@ def validate_detector(detector: Detector, scenes: SceneReader, jobs: int = 0) ->
     """Evaluate a detector on every scene by KITTI's protocol."""
     report = DetectionReport()
     items = load_items(scenes, ([n] for n in range(len(scenes))), jobs)
-    for item, in track(items, "validating", len(scenes)):
+    for item, in show_progress(items, "validating", len(scenes)):
         report.skipped += item.skipped
         if item.sample is not None:
             report.update(detect_in_frame(item.sample, detector))

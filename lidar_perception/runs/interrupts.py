@@ -1,4 +1,4 @@
-"""Signals that stop a command."""
+"""Handling of the signals that stop a command."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def terminated_as_interrupted() -> Iterator[None]:
-    """SIGTERM is what ctrl-C is, a KeyboardInterrupt, in the main thread and where nobody else
-    handles it."""
+def interrupt_on_sigterm() -> Iterator[None]:
+    """Raise KeyboardInterrupt on SIGTERM, as on ctrl-C.
+
+    Only in the main thread, and only if there is no other handler.
+    """
     if (threading.current_thread() is not threading.main_thread()
-            or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL):
+        or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL):
         yield
         return
     signal.signal(signal.SIGTERM, signal.default_int_handler)
