@@ -289,6 +289,13 @@ def test_kernel_of_avx2_on_a_wider_processor():
     subprocess.run([sys.executable, "-c", KERNEL], env=environment, check=True)
 
 
+@pytest.mark.parametrize("variable", ["NUMBA_DISABLE_JIT=1", "NUMBA_ENABLE_AVX=0"])
+def test_without_vectors_torch_runs_the_network(variable):
+    name, value = variable.split("=")
+    code = "from lidar_perception.detectors.matrix_kernel import LANES; assert LANES == 0"
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, name: value}, check=True)
+
+
 def test_dilation_grows_along_both_axes():
     mask = np.zeros((9, 7), bool)
     mask[0, 6] = mask[5, 2] = True
