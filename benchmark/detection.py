@@ -20,9 +20,11 @@ from lidar_perception.detectors.contract import FUSED, Found
 from lidar_perception.detectors.devices import chosen_device
 from lidar_perception.detectors.open import POINTPILLARS, open_detector
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS, network_config
-from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
+from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
 from lidar_perception.detectors.pointpillars.network import make_network
 from lidar_perception.detectors.pointpillars.params import STEPS
+from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
+from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.runs.machine import read_cpu_name
 from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.types import LidarFrame
@@ -57,7 +59,7 @@ def _medians(detectors: dict[str, PointPillarsDetector], scans: list[LidarFrame]
     for i, scan in enumerate(show_progress(scans, title, len(scans))):
         for j in range(repeat):
             for version, detector in detectors.items():
-                said = detector(scan).ms
+                said = detector(scan).timings
                 ms[version][i, j] = [said[step] for step in STEPS]
     found: dict[str, dict] = {}
     for version, runs in ms.items():
@@ -93,14 +95,14 @@ def _random_detector(version: str, size: str, device: torch.device,
     config = network_config(version, size)
     torch.manual_seed(0)
     heard = Heard(TorchNetwork(make_network(config).eval(), device))
-    detector = PointPillarsDetector(heard, Header(config), device)
+    detector = PointPillarsDetector(PointPillarsProposer(heard, Header(config), device))
     detector.warm_up()
     detector(scan)
     assert heard.logits is not None
     best = torch.sigmoid(heard.logits.amax(dim=1))
     least = float(best.topk(min(CANDIDATES, len(best))).values[-1])
     detector = detector.with_min_score(least)
-    detector.network = heard.network
+    detector.proposer.network = heard.network
     detector(scan)
     return detector
 

@@ -13,6 +13,7 @@ from benchmark.plain_pointnet2 import PlainPointNet2
 from benchmark.timing import Calls, interleaved
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of, network_input
 from lidar_perception.detectors.pointnet.config import pointnet_config
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
@@ -35,7 +36,7 @@ def measure_pointnet(scans: Sequence[LidarFrame], repeat: int) -> dict:
     networks = {name: fused(make_pointnet(pointnet_config(name)))
                 for name in ("improved", "pointnet2", "pointnet")}
     plain = PlainPointNet2(config).eval()
-    detector = PointNetDetector(make_pointnet(config), Header(config))
+    detector = PointNetDetector(PointNetClassifier(make_pointnet(config), Header(config)))
     detector.warm_up()
     rows, steps, counts = [], [], []
     for scan in scans:
@@ -48,7 +49,7 @@ def measure_pointnet(scans: Sequence[LidarFrame], repeat: int) -> dict:
         interleaved(calls, 1)
         ms, said = interleaved(calls, repeat)
         rows.append(ms)
-        steps.append([said["detector"].ms[step] for step in STEPS])
+        steps.append([said["detector"].timings[step] for step in STEPS])
         counts.append((len(some), len(every), len(scan)))
     middle = np.median(counts, axis=0)
     return {"clusters": float(middle[0]), "all_clusters": float(middle[1]),

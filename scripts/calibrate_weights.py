@@ -32,7 +32,7 @@ def uncalibrated(weights: Path) -> NetworkDetector:
     """The detector of a checkpoint with its network's own scores."""
     detector = open_detector(weights, "cpu")
     assert isinstance(detector, NetworkDetector)
-    return detector.raw().with_min_score(LEAST)
+    return detector.with_raw_scores().with_min_score(LEAST)
 
 
 @click.command()

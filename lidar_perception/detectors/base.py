@@ -1,51 +1,47 @@
-"""What detectors with a network share: their parameters, the device, and what takes over."""
+"""The base class of detectors with networks: input checks, cropping and parameters."""
 
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from time import perf_counter
-from typing import Any, Self, TypeVar
+from dataclasses import replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 
-from lidar_perception.detectors.calibration import raw_score
-from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Cloud, Found, accept, joined
-from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
-from lidar_perception.ground.params import set_sensor_height
+from lidar_perception.detectors.trained_network import TrainedNetwork
+from lidar_perception.ground.params import SensorPoseParams, set_sensor_height
 from lidar_perception.ground.segment import crop_with_sensor_pose
-from lidar_perception.intensity import MIN_POINTS
-from lidar_perception.types import InputError, LidarFrame
-
-Result = TypeVar("Result")
-
-
-@dataclass
-class Place:
-    """Where a network runs; fallback: why the CPU took over, or None. All detectors of the network
-    share it."""
-
-    device: torch.device
-    fallback: str | None = None
+from lidar_perception.types import SENSOR_HEIGHT, InputError, LidarFrame
 
 
 class NetworkDetector:
-    """Base of the detectors. params, their parameters, may be replaced at any time."""
+    """Base class of the detectors.
 
-    def __init__(self, header: Header, device: torch.device, params: Any):
-        self.header, self.config, self.params = header, header.config, params
-        self.place = Place(device)
-        self.doubt: str | None = None  # of its scores, or of its classes
+    Attributes:
+        params: dataclass with the groups input, crop, ground, ... and `group`; see with_params.
+        warning: why scores are not reliable or classes are never detected, or None.
+    """
+
+    group: ClassVar[str]  # the detector's own group of params, a NetworkParams
+
+    def __init__(self, params: Any, warning: str | None = None):
+        self.params, self.warning = params, warning
+
+    @property
+    def networks(self) -> tuple[TrainedNetwork, ...]:
+        """The networks; the first one decides which classes are detected and where."""
+        raise NotImplementedError
 
     def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
-        """See contract.Detector. InputError also where CUDA is out of memory and the CPU may not
-        take over."""
+        """Return the objects in a cloud, see contract.Detector.
+
+        Raises:
+            InputError: also if CUDA is out of memory and the parameter cpu_fallback is off.
+        """
         frame, ground, cluster_ids, problem = accept(cloud, ground, cluster_ids,
                                                      self.settings.intensity_scale)
         if self.params.crop.enabled:
@@ -58,13 +54,8 @@ class NetworkDetector:
 
     def detect(self, frame: LidarFrame, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> Found:
-        """The objects in a frame that is cropped."""
+        """Return the objects in a frame that is checked and cropped already."""
         raise NotImplementedError
-
-    @property
-    def group(self) -> str:
-        """The group of params that is its own: where it runs, and what counts as a detection."""
-        return self.header.network
 
     @property
     def settings(self) -> NetworkParams:
@@ -73,111 +64,75 @@ class NetworkDetector:
 
     @property
     def device(self) -> torch.device:
-        """Where the network runs now."""
-        return self.place.device
+        """Device that the first network runs on now."""
+        return self.networks[0].device
 
     @property
     def fallback(self) -> str | None:
-        """Why the CPU took over, or None."""
-        return self.place.fallback
+        """Why a network runs on the CPU instead of the chosen device, or None."""
+        return next((network.placement.fallback for network in self.networks
+                     if network.placement.fallback), None)
+
+    @fallback.setter
+    def fallback(self, reason: str | None) -> None:
+        self.networks[0].placement.fallback = reason
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """What it was trained to detect."""
-        return self.config.classes
+        """Names of the classes that it can detect."""
+        return self.networks[0].classes
 
     @property
     def min_scores(self) -> dict[str, float]:
-        """By class, the least score of a detection."""
-        return {name: self.settings.scores.of_class(name) for name in self.classes}
+        """Threshold of each class, 0..1."""
+        return self.settings.scores.of_classes(self.classes)
 
     @property
     def range(self) -> str:
         """What the detector covers: "ahead" of the sensor only, or all "around" it."""
-        low = getattr(self.config, "low", None)  # only some networks have a range
+        low = getattr(self.networks[0].config, "low", None)  # PointNet has no range
         return "around" if low is None or low[0] < 0 else "ahead"
 
-    def raw_min_scores(self) -> list[float]:
-        """The same in the order of classes, before calibration."""
-        return [raw_score(name, score, self.header.calibration)
-                for name, score in self.min_scores.items()]
-
-    def raw(self) -> Self:
-        """The same detector, of the same network, with the network's own scores."""
+    def with_params(self, params: Any) -> Self:
+        """Return this detector, with the same networks, for other parameters."""
         other = copy.copy(self)
-        other.header = replace(self.header, calibration={})
+        other.params = params
         return other
-
-    def with_range(self, range: str) -> Self:
-        """Return this detector, with the same network, for another range: ahead, around, or auto,
-        what its weights were trained for. A network without such a range always sees all
-        around. InputError where the network cannot see that range."""
-        if range == "ahead":
-            raise InputError(f"{self.header.network} sees all around; crop.* leaves out what is "
-                             "not wanted")
-        return self
 
     def with_min_score(self, min_score: float) -> Self:
-        """The same detector, of the same network, with this least score for every class."""
-        other = copy.copy(self)
+        """Return this detector with one threshold for all classes."""
         settings = replace(self.settings, scores=ScoreParams.all_alike(min_score))
-        other.params = replace(self.params, **{self.group: settings})
-        return other
+        return self.with_params(replace(self.params, **{self.group: settings}))
 
     def mounted_at(self, height: float) -> Self:
-        """The same detector, of the same network, for a sensor so many metres above the ground."""
-        other = copy.copy(self)
-        other.params = set_sensor_height(self.params, height)
-        return other
+        """Return this detector for a sensor mounted `height` metres above the ground."""
+        return self.with_params(set_sensor_height(self.params, height))
 
-    def bring_to(self, device: torch.device) -> None:
-        """Bring the network, and what it needs, to a device."""
+    def with_range(self, range: str) -> Self:
+        """Return this detector for another range.
+
+        Args:
+            range: ahead, around, or auto, the range that its weights were trained for. PointNet
+                always sees all around.
+
+        Raises:
+            InputError: the network cannot see that range.
+        """
+        if range == "ahead":
+            raise InputError(f"{self.group} sees all around; leave out what is not wanted with "
+                             "crop.*")
+        return self
+
+    def with_raw_scores(self) -> Self:
+        """Return this detector with the scores of its network instead of calibrated ones."""
         raise NotImplementedError
 
-    def move(self, device: torch.device) -> None:
-        """Run on another device from now on, or on the CPU if it is out of memory."""
-        self.place.device = device
-        try:
-            self.bring_to(device)
-        except torch.cuda.OutOfMemoryError as error:
-            self._fall_back(error)
 
-    def guarded(self, work: Callable[[], Result]) -> Result:
-        """What work() gives; once more on the CPU if the device is out of memory. InputError
-        where the CPU may not take over."""
-        try:
-            return work()
-        except torch.cuda.OutOfMemoryError as error:
-            self._fall_back(error)
-            return work()
-
-    def _fall_back(self, error: Exception) -> None:
-        if self.device == CPU or not self.settings.cpu_fallback:
-            raise InputError(f"{self.device} is out of memory; use the CPU or a smaller network"
-                             ) from error
-        self.place.fallback = (f"{self.device} is out of memory, so the network runs on the CPU; "
-                               "close other programs and start again")
-        self.move(CPU)
-
-    def now(self) -> float:
-        """Seconds of a clock, after what the device has been asked to do is done."""
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        return perf_counter()
-
-    def no_intensity(self, frame: LidarFrame) -> str | None:
-        """Say that the network misses the intensity of a frame; None where there is one, or it
-        shall not be read."""
-        if not self.settings.intensity_scale or (frame.intensity is not None and (
-                len(frame) < MIN_POINTS or frame.intensity.any())):
-            return None
-        lack = "has no intensity" if frame.intensity is None else "has the intensity 0 everywhere"
-        return f"the cloud {lack}, which the network was trained with; it reads zeros"
-
-    def nothing_passed(self, highest: Iterable[float]) -> tuple[dict[str, float], str | None]:
-        """The highest score of each class, where none reached its threshold, and what is wrong if
-        they are no numbers."""
-        best = dict(zip(self.classes, highest))
-        broken = any(map(math.isnan, best.values()))
-        return best, ("the network's scores are not numbers (NaN); the weights or the intensity "
-                      "are broken" if broken else None)
+def make_synthetic_frame(pose: SensorPoseParams) -> LidarFrame:
+    """Return flat ground with one object on it, for the first run of a detector."""
+    rng = np.random.default_rng(0)
+    ground = rng.uniform(0, 40, (2000, 3)) * [1, 1, 0.001] - [0, 20, SENSOR_HEIGHT]
+    target = rng.uniform(-0.5, 0.5, (400, 3)) + [8, 0, -0.8]
+    xyz = np.concatenate([ground, target]).astype(np.float32)
+    xyz[:, 2] -= pose.height - SENSOR_HEIGHT
+    return LidarFrame(xyz, np.zeros(len(xyz), np.float32))

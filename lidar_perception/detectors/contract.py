@@ -22,15 +22,17 @@ FUSED = "fused"  # the default where one detector is wanted: all of them togethe
 
 @dataclass(frozen=True)
 class Found:
-    """What a detector says of one frame.
+    """The result of a detector for one cloud.
 
-    detections in the frame's own coordinates, without what carries the sensor; ms: time of each
-    step (on CUDA after synchronisation); problem: why nothing, or little, can be detected, with the
-    remedy, or None; best: where no score reached its threshold, the highest score of each class.
+    Attributes:
+        detections: in the coordinates of the cloud, without the vehicle that carries the sensor.
+        timings: milliseconds of each step (on CUDA after synchronisation).
+        problem: why nothing, or little, can be detected, with the remedy, or None.
+        best: highest score of each class if no score reached its threshold; otherwise empty.
     """
 
     detections: Detections
-    ms: Mapping[str, float] = field(default_factory=dict)
+    timings: Mapping[str, float] = field(default_factory=dict)
     problem: str | None = None
     best: Mapping[str, float] = field(default_factory=dict)
 
@@ -87,8 +89,8 @@ def accept(cloud: Cloud, ground: np.ndarray | None, cluster_ids: np.ndarray | No
     """
     frame = as_frame(cloud)
     check_columns(len(frame), ground=ground, cluster_ids=cluster_ids)
-    ground, cluster_ids = (column if column is None else np.asarray(column)
-                           for column in (ground, cluster_ids))
+    ground = None if ground is None else np.asarray(ground, bool)
+    cluster_ids = None if cluster_ids is None else np.asarray(cluster_ids)
     if frame is not cloud and not (usable := usable_returns(frame.xyz)).all():
         kept = np.flatnonzero(usable)
         frame = frame.take(kept)

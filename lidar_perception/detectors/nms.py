@@ -1,7 +1,5 @@
-"""Non-maximum suppression of turned boxes, exact, on the CPU.
-
-The few hundred boxes that are left after the score threshold are compared faster there than a GPU
-can be asked.
+"""Exact non-maximum suppression of rotated boxes, on the CPU: for the few hundred boxes above the
+score threshold it is faster than a call to a GPU.
 """
 
 from __future__ import annotations
@@ -14,51 +12,59 @@ from lidar_perception.geometry import MAX_CORNERS, footprint_radii, overlap_area
 from lidar_perception.types import CLASSES, Detections
 
 
-def best_of_each(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray,
-                 classes: tuple[str, ...], params: NmsParams) -> Detections:
-    """Detections, best first, of the boxes (N, 7) with scores (N,) that stay; labels (N,) int are
-    indices in classes."""
-    kept = suppressed(boxes, scores, labels, params.iou, params.across_classes)[:params.max_boxes]
+def apply_nms(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray,
+              classes: tuple[str, ...], params: NmsParams) -> Detections:
+    """Return the boxes that survive NMS as detections, best score first.
+
+    Args:
+        boxes: (N, 7), with scores (N,).
+        labels: (N,) int, indices into `classes`.
+    """
+    kept = rotated_nms(boxes, scores, labels, params.iou, params.across_classes)[:params.max_boxes]
     ids = np.array([CLASSES.index(name) for name in classes])
     return Detections.of(boxes[kept], ids[labels[kept]], scores[kept])
 
 
-def suppressed(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: float,
-               across_classes: bool = False) -> np.ndarray:
-    """(M,) int64 indices of the boxes (N, 7) that stay, best score first, then the first.
+def rotated_nms(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: float,
+                across_classes: bool = False) -> np.ndarray:
+    """Return the indices (M,) int64 of the boxes (N, 7) that survive, best score first; equal
+    scores keep their order.
 
-    A box goes if one that stays has a higher score, the same label (N,) int (any, with
-    across_classes) and an IoU above iou, seen from above.
+    A box is dropped if a surviving box has a higher score, the same label (N,) int (any label with
+    across_classes), and a bird's-eye-view IoU with it above `iou`.
     """
     order = np.argsort(-scores, kind="stable")
     group = np.zeros(len(order), np.int64) if across_classes else np.asarray(labels)[order]
     ordered = np.asarray(boxes, np.float64).reshape(-1, 7)[order]
-    return order[_stay(ordered, group, iou)]
+    return order[_is_kept(ordered, group, iou)]
 
 
 @njit(cache=True, nogil=True)
-def _stay(boxes, group, iou):
-    stays = np.ones(len(boxes), np.bool_)
+def _is_kept(boxes, group, iou):
+    kept = np.ones(len(boxes), np.bool_)
     reach, work = footprint_radii(boxes), np.empty((4, MAX_CORNERS))
     area = boxes[:, 3] * boxes[:, 4]
     for i in range(len(boxes)):
-        if not stays[i]:
+        if not kept[i]:
             continue
         for j in range(i + 1, len(boxes)):
-            if stays[j] and group[i] == group[j]:
+            if kept[j] and group[i] == group[j]:
                 shared = overlap_area(boxes[i], boxes[j], reach[i] + reach[j], work)
-                stays[j] = shared <= 0 or shared / (area[i] + area[j] - shared) <= iou
-    return stays
+                kept[j] = shared <= 0 or shared / (area[i] + area[j] - shared) <= iou
+    return kept
 
 
 @njit(cache=True, nogil=True)
-def first_of_each(again):
-    """(N,) bool: which stay of N things, again (N, N) bool: one goes that is one which stays, and
-    stands before it, again."""
-    stays = np.ones(len(again), np.bool_)
-    for i in range(len(again)):
-        if stays[i]:
-            for j in range(i + 1, len(again)):
-                if again[i, j]:
-                    stays[j] = False
-    return stays
+def keep_first(is_duplicate):
+    """Return which of N items are kept, (N,) bool.
+
+    is_duplicate (N, N) bool: item j is dropped if is_duplicate[i, j] for an earlier item i that is
+    kept.
+    """
+    kept = np.ones(len(is_duplicate), np.bool_)
+    for i in range(len(is_duplicate)):
+        if kept[i]:
+            for j in range(i + 1, len(is_duplicate)):
+                if is_duplicate[i, j]:
+                    kept[j] = False
+    return kept

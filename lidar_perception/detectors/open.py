@@ -48,6 +48,9 @@ class Configured(Detector, Protocol):
 
     params: Any
 
+    def with_params(self, params: Any) -> Self:
+        """Return this detector with other parameters; this one does not change."""
+
     def with_range(self, range: str) -> Self:
         """Return this detector with another range, see base.NetworkDetector."""
 
@@ -102,7 +105,7 @@ def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
         if min_score is not None:
             detector = detector.with_min_score(min_score)
         if settings:
-            detector.params = with_values(detector.params, settings)
+            detector = detector.with_params(with_values(detector.params, settings))
     except ValueError as error:
         raise InputError(str(error)) from None
     return detector

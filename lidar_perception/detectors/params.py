@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +36,10 @@ class ScoreParams(Params):
     def of_class(self, name: str) -> float:
         """The threshold of a class of types.CLASSES."""
         return getattr(self, name.lower(), self.other)
+
+    def of_classes(self, names: Iterable[str]) -> dict[str, float]:
+        """The thresholds of several classes by name."""
+        return {name: self.of_class(name) for name in names}
 
     def passed(self, detections: Detections) -> np.ndarray:
         """(K,) bool: which of K detections reach the threshold of their class."""

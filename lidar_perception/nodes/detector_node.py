@@ -34,12 +34,12 @@ class DetectorNode(ManagedNode):
         self.outputs = DetectionOutputs(self, self.steps)
         with report_compilation(self.get_logger().info, whole_detector=True):
             self.detector = self._loaded()
-        config = self.detector.config
-        self.counts.update(network=f"{self.name_of(config)}, {' '.join(config.classes)}",
+        name = self.name_of(self.detector.networks[0].config)
+        self.counts.update(network=f"{name}, {' '.join(self.detector.classes)}",
                            device=str(self.detector.device))
-        if self.detector.doubt:  # beside the state, which says what the node waits for
-            self.counts["doubt"] = self.detector.doubt
-            self.get_logger().warning(self.detector.doubt)
+        if self.detector.warning:  # beside the state, which says what the node waits for
+            self.counts["doubt"] = self.detector.warning
+            self.get_logger().warning(self.detector.warning)
         if self.detector.fallback:
             self.report(WARN, self.detector.fallback)
         self.input("points", CLOUD, self.on_points)
@@ -74,7 +74,7 @@ class DetectorNode(ManagedNode):
                 device, missing = "cpu", f"{error}; the CPU is used"
         with lock_compilation(self.get_logger().info):
             detector = self.load(weights, device)
-        detector.place.fallback = detector.fallback or missing
+        detector.fallback = detector.fallback or missing
         return detector
 
     def on_points(self, msg: Any) -> None:
@@ -82,13 +82,13 @@ class DetectorNode(ManagedNode):
             frame, indices, params = self.sensor.frame(msg, with_intensity=True)
             ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
             own = getattr(params, self.group)
-            self.detector.params = self._with_weak(params, own)
-            found = self.detector(frame, ground=None if ground is None else ground > 0,
-                                  cluster_ids=None if clusters is None else clusters[0])
+            detector = self.detector.with_params(self._with_weak(params, own))
+            found = detector(frame, ground=None if ground is None else ground > 0,
+                             cluster_ids=None if clusters is None else clusters[0])
             weak = found.detections
             if self.outputs.tracks is not None:
                 found = replace(found, detections=weak[own.scores.passed(weak)])
-            untracked = self.outputs.publish(msg.header, found.detections, found.ms, frame.xyz,
+            untracked = self.outputs.publish(msg.header, found.detections, found.timings, frame.xyz,
                                              weak=weak)
         self._diagnose(frame, found, params, untracked)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import ndtr
 
-from lidar_perception.detectors.nms import suppressed
+from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.tracking import existence, motion
 from lidar_perception.tracking.association import FORBIDDEN, assigned, costs
 from lidar_perception.tracking.params import KIND_OF_CLASS, TrackingParams
@@ -139,7 +139,7 @@ def alive(states: States, params: TrackingParams, fixed: bool) -> States:
     states = states.take(np.flatnonzero(
         existence.probability(states.present) >= params.existence.end))
     rank = probabilities(states, params, fixed)
-    stays = suppressed(states.boxes(), rank, states.class_ids, params.overlap, across_classes=True)
+    stays = rotated_nms(states.boxes(), rank, states.class_ids, params.overlap, across_classes=True)
     return states.take(np.sort(stays[:params.max_tracks]))
 
 

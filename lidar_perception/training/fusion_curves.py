@@ -17,7 +17,7 @@ import numpy as np
 from lidar_perception.classes import CAR, DETECTED
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import NETWORKS, Header
-from lidar_perception.detectors.fused.detector import FusedDetector, Look, load_fused_detector
+from lidar_perception.detectors.fused.detector import FusedDetector, Proposals, load_fused_detector
 from lidar_perception.detectors.fused.evidence import Evidence
 from lidar_perception.detectors.fused.fusion import KNOTS, Models, package_models, write_fusion
 from lidar_perception.detectors.fused.model import probabilities
@@ -117,12 +117,12 @@ def fit_fusion(weights: Path | None, classifier: Path | None, out: Path, params:
     own = FusedParams(weights=str(weights or ""), classifier=str(classifier or ""),
                       range=params.range, threads=1, warm_up=False)
     detector = load_fused_detector("", "cpu", FusedDetectorParams(fused=own))
-    header, other = detector.header, detector.classifier.header
+    header, other = detector.proposer.header, detector.classifier.header
     params = fill_from_header(params, header)
     sensor = sensor_named(params.sensor, params.mount_height or _find_trained_height(header))
     scenes = Scenes(None, params.people, params.scene)
     scenes.sorts()  # raises InputError for an unknown one
-    around = bool(detector.config.low[0] < 0)
+    around = detector.range == "around"
     errors.print(f"{params.scans} {params.scene} scans of {params.sensor} at {sensor.height:g} m, "
                  f"{'all around' if around else 'ahead'}")
     for network in header, other:
@@ -166,14 +166,14 @@ def _read_sensor(header: Header) -> dict[str, Any]:
     return sensor if isinstance(sensor, dict) else {}
 
 
-def collect_samples(frame: Frame, look: Look, scan: int) -> Samples:
+def collect_samples(frame: Frame, proposals: Proposals, scan: int) -> Samples:
     """Return the proposals of a simulated frame that count, and whether each is correct.
 
     Proposals outside the image do not count if there is a camera. Of several correct ones about an
     object only the best counts, as only one is kept. Proposals on objects that merely resemble the
     class (a van for a car) do not count, as in the evaluation of detections.
     """
-    truth, camera, found = frame.truth(), frame.camera(), look.proposed
+    truth, camera, found = frame.truth(), frame.camera(), proposals.detections
     assert truth is not None  # simulated scans always have it
     centres = found.boxes[:, :3] - np.array([0, 0, frame.sensor_height - SENSOR_HEIGHT], np.float32)
     in_view = np.ones(len(found), bool) if camera is None else camera.in_view(centres)
@@ -194,7 +194,7 @@ def collect_samples(frame: Frame, look: Look, scan: int) -> Samples:
             right.append(len(free) > 0)
     chosen = np.array(kept, np.int64)
     return Samples(found.class_ids[chosen], np.array(right, bool), np.full(len(chosen), scan),
-                   {name: odds[chosen] for name, odds in look.evidence.items()})
+                   {name: odds[chosen] for name, odds in proposals.evidence.items()})
 
 
 def _match_boxes(boxes: np.ndarray, objects: np.ndarray, name: str) -> np.ndarray:
@@ -220,7 +220,7 @@ def _make_sampler(params: FusedDetectorParams,
 
     def sample_scan(i: int) -> tuple[int, Samples]:
         frame = scenes.frame(i)
-        proposals = detector.mounted_at(frame.sensor_height).look(frame.load())
+        proposals = detector.mounted_at(frame.sensor_height).propose(frame.load())
         return i, collect_samples(frame, proposals, i)
     return sample_scan
 

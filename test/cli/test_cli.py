@@ -450,7 +450,7 @@ def test_settings_of_a_detector_take_effect_and_win():
         "pointpillars.warm_up=no"))["detector"]
     detector = made.open(sensor_height=1.0, min_score=0.001)
     assert detector.min_scores == {"Car": 0.7, "Pedestrian": 0.001, "Cyclist": 0.001}
-    assert detector.config.low[0] < 0 and detector.params.ground.sensor_pose.height == 1.0
+    assert detector.range == "around" and detector.params.ground.sensor_pose.height == 1.0
     with pytest.raises(InputError, match="give one of them"):
         DetectorChoice("f.json", settings={"fused.weights": "a"}).open()
 

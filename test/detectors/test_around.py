@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pointnet_samples
 import pytest
-from detection_samples import random_detector, same, tiny
+from detection_samples import make_detector, random_detector, same, tiny
 
 from lidar_perception.classes import CAR
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.normalized_view import rotate_boxes_half_turn, rotate_half_turn
 from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointpillars.config import HALF, RANGES
-from lidar_perception.detectors.pointpillars.detector import CPU, PointPillarsDetector
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
-from lidar_perception.detectors.view import turned_about, turned_boxes
 from lidar_perception.geometry import horizontal_range
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.scoring.centres.matching import match_centres
@@ -50,9 +50,9 @@ def test_a_turned_cloud_has_the_turned_boxes(version, street):
     detector = shipped(version, "around")
     columns = columns_of(street.frame)
     found = detector(street.frame, **columns).detections
-    turned = detector(turned_about(street.frame), **columns).detections
+    turned = detector(rotate_half_turn(street.frame), **columns).detections
     assert min((found.boxes[:, 0] > 3).sum(), (found.boxes[:, 0] < -3).sum()) > 3
-    assert same(turned, replace(found, boxes=turned_boxes(found.boxes)), atol=1e-4)
+    assert same(turned, replace(found, boxes=rotate_boxes_half_turn(found.boxes)), atol=1e-4)
 
 
 def test_cars_that_are_plain_to_see_are_found_behind_and_beside(street):
@@ -71,8 +71,8 @@ def test_cars_that_are_plain_to_see_are_found_behind_and_beside(street):
 
 def test_away_from_the_border_it_says_what_one_look_says(street):
     detector, columns = shipped(), columns_of(street.frame)
-    half = replace(detector.header, config=replace(detector.config, **HALF))
-    one = PointPillarsDetector(detector.network, half, CPU, detector.params)
+    half = replace(detector.proposer.header, config=replace(detector.proposer.config, **HALF))
+    one = make_detector(detector.proposer.network, half, detector.params)
     apart = [found[np.flatnonzero(found.boxes[:, 0] > 8)] for found in (
         each(street.frame, **columns).detections for each in (one, detector.with_range("around")))]
     assert len(apart[0]) > 3 and same(*apart)
@@ -82,10 +82,11 @@ def test_there_and_back_it_is_the_same_detector(street):
     detector = shipped("v1")
     around = detector.with_range("around")
     assert detector.with_range("auto") is detector.with_range("ahead") is detector
-    assert around.with_range("around") is around and around.config.low == RANGES["around"]["low"]
+    assert around.with_range("around") is around
+    assert around.proposer.config.low == RANGES["around"]["low"]
     assert same(around.with_range("ahead")(street.frame), detector(street.frame))
     trained = random_detector(**RANGES["around"])  # one look of it is enough
-    assert trained.with_range("around") is trained and len(trained.turns) == 1
+    assert trained.with_range("around") is trained and len(trained.proposer.half_turns) == 1
 
 
 def test_nothing_behind_or_nothing_at_all_is_no_trouble(street):
@@ -98,13 +99,13 @@ def test_nothing_behind_or_nothing_at_all_is_no_trouble(street):
 
 def test_what_cannot_see_that_says_so():
     config = pointnet_samples.small()
-    pointnet = PointNetDetector(pointnet_samples.lively(config), Header(config), CPU)
+    pointnet = PointNetDetector(PointNetClassifier(pointnet_samples.lively(config), Header(config)))
     assert pointnet.with_range("around") is pointnet
-    with pytest.raises(InputError, match="pointnet sees all around; crop"):
+    with pytest.raises(InputError, match="pointnet sees all around; leave out"):
         pointnet.with_range("ahead")
     with pytest.raises(InputError, match="cannot see around: a grid of"):
         random_detector(low=(0.0, -3.52, -3.0), high=(7.04, 3.52, 1.0),
                         cell=0.22).with_range("around")
-    exported = PointPillarsDetector(lambda pillars, maps: None, Header(tiny()), CPU)
-    with pytest.raises(InputError, match="take the checkpoint to see around"):
+    exported = make_detector(lambda pillars, maps: None, Header(tiny()))
+    with pytest.raises(InputError, match="use the checkpoint to see around"):
         exported.with_range("around")

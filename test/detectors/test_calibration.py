@@ -54,10 +54,11 @@ def test_the_order_stays_and_a_threshold_is_found_again(scores, slope, offset):
 def test_a_detector_finds_the_same_boxes_and_its_threshold_is_a_probability(make):
     detector, scan = make().with_min_score(0.0), frame()
     plain = detector(scan).detections
-    detector.header = replace(detector.header, calibration=LINES)
+    (network,) = detector.networks
+    network.header = replace(network.header, calibration=LINES)
     found = detector(scan).detections
     assert len(found) and same(found, calibrated(plain, LINES), atol=1e-6)
-    assert same(detector.raw()(scan), plain)
+    assert same(detector.with_raw_scores()(scan), plain)
     middle = float(np.median(found.scores))
     # What is weak suppresses nothing that is strong, so a threshold takes the weak away alone.
     strict = detector.with_min_score(middle)(scan).detections

@@ -15,12 +15,12 @@ from samples import CALIBRATION, crowd
 
 from lidar_perception.classes import CAR
 from lidar_perception.data.frame import Frame
-from lidar_perception.detectors import view
+from lidar_perception.detectors import normalized_view
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.normalized_view import restore_detections, without_carrier
 from lidar_perception.detectors.pointnet import weights_file as pointnet_weights
 from lidar_perception.detectors.pointpillars import weights_file as pointpillars_weights
-from lidar_perception.detectors.view import as_found, without_carrier
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.scoring.comparison.contenders import contenders
@@ -134,14 +134,15 @@ def test_the_car_that_carries_the_sensor_is_left_out_and_the_next_one_stays(pose
                      [0.8, -1.7, up - 1.0, 4.0, 1.7, 1.5, -0.1],
                      [-1.5, -0.2, up - 1.1, 4.0, 1.6, 1.5, 1.6]])
     other = [0.0, -2.8, up - 1.0, 4.0, 1.6, 1.5, 0.0]
-    found = as_found(Detections.of([*roof, other], CAR), pose).boxes
+    found = restore_detections(Detections.of([*roof, other], CAR), pose).boxes
     assert len(found) == 1 and abs(found[0, 1]) == np.float32(2.8)
     low = Detections.of(roof - [0, 0, 4.3, 0, 0, 0, 0], CAR)
-    assert len(as_found(low, pose)) == 3
+    assert len(restore_detections(low, pose)) == 3
 
 
 def test_every_network_leaves_out_what_carries_it(detectors, frame, monkeypatch):
-    monkeypatch.setattr(view, "without_carrier", lambda detections, height: detections[:0])
+    monkeypatch.setattr(normalized_view, "without_carrier",
+                        lambda detections, height: detections[:0])
     for name in NAMES:
         if name.startswith("P"):
             assert len(detectors[name](frame.load()).detections) == 0
@@ -154,7 +155,7 @@ def test_called_again_it_says_the_same_and_leaves_the_frame(detectors, frame, na
     first, again = (detectors[name](scan) for _ in range(2))
     assert isinstance(first, Found) and same(first, again)
     assert (first.problem, first.best) == (again.problem, again.best)
-    assert first.ms.keys() == again.ms.keys()
+    assert first.timings.keys() == again.timings.keys()
     assert {CLASSES[i] for i in first.detections.class_ids} <= set(detectors[name].classes)
     np.testing.assert_array_equal(scan.xyz, before[0])
     np.testing.assert_array_equal(scan.intensity, before[1])

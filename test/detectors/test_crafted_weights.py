@@ -10,7 +10,7 @@ import random
 import numpy as np
 import pytest
 import torch
-from detection_samples import eager, frame, lively, same, tiny
+from detection_samples import eager, frame, lively, make_detector, same, tiny
 from safetensors.torch import save
 
 from lidar_perception.detectors.checkpoint import KEY, Header, read_header
@@ -18,12 +18,8 @@ from lidar_perception.detectors.pointnet.config import pointnet_config
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointnet.network import make_pointnet
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
-from lidar_perception.detectors.pointpillars.detector import (
-    CPU,
-    PointPillarsDetector,
-    TorchNetwork,
-    load_detector,
-)
+from lidar_perception.detectors.pointpillars.detector import load_detector
+from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import InputError
 
@@ -123,8 +119,7 @@ def test_weights_that_say_the_same_everywhere_detect_nothing_and_are_named():
         for tensor in network.state_dict().values():
             tensor.fill_(0)
         network.head.scores.bias.fill_(value)
-        found = PointPillarsDetector(TorchNetwork(network), Header(config), CPU,
-                                     eager(score=0.1))(frame())
+        found = make_detector(TorchNetwork(network), Header(config), eager(score=0.1))(frame())
         assert len(found.detections) == 0 and "same scores" in found.problem
 
 
@@ -174,5 +169,5 @@ def test_tensors_of_other_types_are_refused(tmp_path):
             load_detector(path, "cpu", eager())
     write(path, {name: value.double() if value.is_floating_point() else value
                  for name, value in state.items()}, Header(config).text())
-    expected = PointPillarsDetector(TorchNetwork(lively(config)), Header(config), CPU, eager())
+    expected = make_detector(TorchNetwork(lively(config)), Header(config), eager())
     assert same(load_detector(path, "cpu", eager(engine="torch"))(frame()), expected(frame()))

@@ -21,11 +21,11 @@ from lidar_perception.detectors.pointpillars.config import (
     NetworkConfig,
     network_config,
 )
-from lidar_perception.detectors.pointpillars.detector import TorchNetwork
 from lidar_perception.detectors.pointpillars.losses import detection_loss
 from lidar_perception.detectors.pointpillars.network import fused, make_network
-from lidar_perception.detectors.pointpillars.pillars import first_of_each, make_pillars
+from lidar_perception.detectors.pointpillars.pillars import keep_first_per_cell, make_pillars
 from lidar_perception.detectors.pointpillars.targets import assign
+from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import InputError
 
@@ -126,7 +126,7 @@ def test_the_first_points_of_each_pillar_are_those_of_a_loop(seed, most):
         counts[cell] = counts.get(cell, 0) + 1
         if counts[cell] <= most:
             kept.append(i)
-    assert first_of_each(cells, most).tolist() == kept
+    assert keep_first_per_cell(cells, most).tolist() == kept
 
 
 def test_the_order_of_the_points_makes_no_difference():

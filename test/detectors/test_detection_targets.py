@@ -10,7 +10,7 @@ from detection_samples import BOXES, LABELS, tiny
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidar_perception.detectors.nms import suppressed
+from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.box_coder import decode, encode
 from lidar_perception.detectors.pointpillars.config import ANCHORS
@@ -253,5 +253,5 @@ def test_suppression_is_that_of_a_slow_loop(seed, across):
         if all(o <= limit for o in overlaps):
             kept.append(i)
     if sure:
-        assert suppressed(boxes, scores, labels, limit, across).tolist() == kept
-    assert suppressed(boxes[:0], scores[:0], labels[:0], limit).tolist() == []
+        assert rotated_nms(boxes, scores, labels, limit, across).tolist() == kept
+    assert rotated_nms(boxes[:0], scores[:0], labels[:0], limit).tolist() == []

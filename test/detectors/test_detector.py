@@ -7,24 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from detection_samples import eager, frame, lively, random_detector, same, tiny
+from detection_samples import eager, frame, lively, make_detector, random_detector, same, tiny
 
 from lidar_perception.clustering.cluster import cluster
 from lidar_perception.clustering.density import measure_density
 from lidar_perception.clustering.shapes import classify_by_diagonal, fit_boxes, fit_ellipses
 from lidar_perception.detectors.checkpoint import Header
-from lidar_perception.detectors.pointpillars import detector as detector_module
+from lidar_perception.detectors.devices import CPU, chosen_device
+from lidar_perception.detectors.normalized_view import NormalizedView, to_sensor_frame
+from lidar_perception.detectors.pointpillars import proposer as proposer_module
 from lidar_perception.detectors.pointpillars.config import VERSIONS, network_config
-from lidar_perception.detectors.pointpillars.detector import (
-    CPU,
-    STEPS,
-    PointPillarsDetector,
-    TorchNetwork,
-    chosen_device,
-)
 from lidar_perception.detectors.pointpillars.expert import draw_clusters, network_input
-from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
-from lidar_perception.detectors.view import in_sensor_frame, visible
+from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND, STEPS
+from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import level_points, segment_ground
 from lidar_perception.param_fields import with_values
@@ -40,7 +35,9 @@ each_version = pytest.mark.parametrize("version", VERSIONS)
 def test_columns_that_are_given_say_the_same_as_those_that_are_computed(version):
     detector = random_detector(version)
     scan = frame()
-    indices, seen = visible(scan, detector.config)
+    config = detector.proposer.config
+    view = NormalizedView.of(scan, low=config.low, high=config.high)
+    indices, seen = view.indices, view.frame
     flat = np.zeros(len(scan), bool)
     flat[indices] = segment_ground(seen, EXPERT_GROUND)
     ids = np.zeros(len(scan), np.uint32)
@@ -59,7 +56,7 @@ def test_versions_see_what_the_paper_says():
     inputs = {}
     for version in VERSIONS:
         config = tiny(version)
-        _, seen = visible(scan, config)
+        seen = NormalizedView.of(scan, low=config.low, high=config.high).frame
         inputs[version] = network_input(seen, config)
     flat = segment_ground(seen, EXPERT_GROUND)
     assert [i.points.shape[1] for i in inputs.values()] == [4, 4, 5, 5, 4]
@@ -115,13 +112,13 @@ def test_a_cluster_on_a_line_is_drawn_where_its_centre_is():
 def test_what_is_visible_does_not_depend_on_the_height_of_the_sensor():
     config, rng = tiny(), np.random.default_rng(0)
     scan = LidarFrame(rng.uniform([-2, -7, -6], [12, 7, 5], (500, 3)).astype(np.float32))
-    indices, seen = visible(scan, config)
+    view = NormalizedView.of(scan, low=config.low, high=config.high)
     higher = replace(scan, xyz=scan.xyz - np.float32([0, 0, 0.5]))
-    again, seen_again = visible(higher, config, SensorPoseParams(height=2.23))
-    assert indices.tolist() == again.tolist() and 50 < len(indices) < 450
-    np.testing.assert_allclose(seen_again.xyz, seen.xyz, atol=1e-5)
+    again = NormalizedView.of(higher, SensorPoseParams(height=2.23), config.low, config.high)
+    assert view.indices.tolist() == again.indices.tolist() and 50 < len(view) < 450
+    np.testing.assert_allclose(again.frame.xyz, view.frame.xyz, atol=1e-5)
     low, high = np.array(config.low), np.array(config.high)
-    assert (seen.xyz >= low).all() and (seen.xyz < high).all()
+    assert (view.frame.xyz >= low).all() and (view.frame.xyz < high).all()
 
 
 def test_detections_are_above_their_thresholds_in_order_and_apart():
@@ -129,9 +126,9 @@ def test_detections_are_above_their_thresholds_in_order_and_apart():
     said = detector(frame())
     found = said.detections
     assert (np.diff(found.scores) <= 0).all() and (found.scores >= 0.25).all()
-    assert {*found.class_ids} <= {CLASSES.index(n) for n in detector.config.classes}
-    assert said.problem is None and list(said.ms) == list(STEPS)
-    assert said.ms["network"] > 0
+    assert {*found.class_ids} <= {CLASSES.index(n) for n in detector.classes}
+    assert said.problem is None and list(said.timings) == list(STEPS)
+    assert said.timings["network"] > 0
     middle = float(np.median(found.scores[found.class_ids == found.class_ids[0]]))
     name = CLASSES[found.class_ids[0]].lower()
     detector.params = with_values(detector.params, {f"pointpillars.scores.{name}": middle})
@@ -156,11 +153,11 @@ def test_a_tilted_sensor_finds_the_same_boxes_in_its_own_frame(roll, pitch):
     pose = SensorPoseParams(roll=roll, pitch=pitch)
     turn = level_points(np.eye(3, dtype=np.float32), pose)  # rows: the sensor's axes when level
     found = Detections.of([[8, 2, -1, 4, 2, 1.5, 0.7]], scores=[0.5])
-    box = in_sensor_frame(found, pose).boxes[0]
+    box = to_sensor_frame(found, pose).boxes[0]
     np.testing.assert_allclose(box[:3] @ turn, [8, 2, -1], atol=1e-5)
     forward = np.array([np.cos(box[6]), np.sin(box[6]), 0]) @ turn
     assert forward[:2] @ [np.cos(0.7), np.sin(0.7)] > 0.97  # yaw is about the sensor's own z
-    assert same(in_sensor_frame(found, SensorPoseParams()), found)
+    assert same(to_sensor_frame(found, SensorPoseParams()), found)
 
 
 def test_intensity_is_scaled_and_may_be_left_out():
@@ -173,7 +170,7 @@ def test_intensity_is_scaled_and_may_be_left_out():
     without = detector(replace(scan, intensity=None))
     assert "no intensity" in without.problem
     half = np.where(np.arange(len(scan)) % 2, np.float32(np.nan), scan.intensity)
-    assert "their intensity is no number" in detector(replace(scan, intensity=half)).problem
+    assert "their intensity is not a number" in detector(replace(scan, intensity=half)).problem
     detector.params = with_values(detector.params, {"pointpillars.intensity_scale": 0.0})
     for blind in scan, replace(scan, intensity=None), replace(scan, intensity=half):
         assert same(detector(blind), without) and detector(blind).problem is None
@@ -186,7 +183,7 @@ def test_intensity_is_scaled_and_may_be_left_out():
 def test_a_cloud_with_nothing_to_see_has_no_detections_and_a_reason(version, xyz, words):
     detector = random_detector(version)
     found = detector(LidarFrame(np.asarray(xyz, np.float32)))
-    assert len(found.detections) == 0 and words in found.problem and found.ms["network"] == 0
+    assert len(found.detections) == 0 and words in found.problem and found.timings["network"] == 0
     assert detector(frame()).problem is None
 
 
@@ -201,14 +198,14 @@ def test_where_nothing_passes_the_best_scores_are_said():
     assert detector(scan).best == {}
     found = detector(scan).detections
     highest = {name: float(found.scores[found.class_ids == CLASSES.index(name)].max())
-               for name in detector.config.classes if CLASSES.index(name) in found.class_ids}
+               for name in detector.classes if CLASSES.index(name) in found.class_ids}
     nothing = detector.with_min_score(1.0)(scan)
     assert len(nothing.detections) == 0 and nothing.problem is None
     assert list(nothing.best) == list(detector.classes)
     assert max(nothing.best.values()) == pytest.approx(max(highest.values()))
     assert all(nothing.best[name] >= score - 1e-6 for name, score in highest.items())
     assert same(detector(scan), found)  # which keeps its own threshold
-    for parameter in detector.network.network.head.parameters():
+    for parameter in detector.proposer.network.network.head.parameters():
         parameter.fill_(np.nan)
     assert "NaN" in detector(scan).problem
 
@@ -248,22 +245,22 @@ class OutOfMemory(TorchNetwork):
 
 def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(monkeypatch):
     config, scan = tiny(), frame()
-    real = detector_module.make_pillars
-    monkeypatch.setattr(detector_module, "make_pillars", lambda clouds, config: real(
+    real = proposer_module.make_pillars
+    monkeypatch.setattr(proposer_module, "make_pillars", lambda clouds, config: real(
         [c if c.device.type == "cpu" else torch.zeros(1, 4) for c in clouds], config))
     meta = torch.device("meta")
-    broken = PointPillarsDetector(OutOfMemory(lively(config)), Header(config), meta, eager())
+    broken = make_detector(OutOfMemory(lively(config)), Header(config), eager(), meta)
     for _ in range(2):
         found = broken(scan)
         assert same(found, random_detector()(scan)) and "CPU" in found.problem
         assert broken.device == CPU
-    broken = PointPillarsDetector(OutOfMemory(lively(config)), Header(config), meta, eager())
-    others = broken.with_min_score(0.5), broken.raw()  # of the same network
+    broken = make_detector(OutOfMemory(lively(config)), Header(config), eager(), meta)
+    others = broken.with_min_score(0.5), broken.with_raw_scores()  # of the same network
     broken(scan)
     assert all(other.device == CPU and "CPU" in other(scan).problem for other in others)
     never = with_values(eager(), {"pointpillars.cpu_fallback": False})
     with pytest.raises(InputError, match="out of memory"):
-        PointPillarsDetector(OutOfMemory(lively(config)), Header(config), meta, never)(scan)
+        make_detector(OutOfMemory(lively(config)), Header(config), never, meta)(scan)
 
 
 @pytest.mark.parametrize("name, words", [("tpu", "no device 'tpu'"), ("mps", "no device 'mps'"),
@@ -280,5 +277,5 @@ def test_real_scans_of_any_version_go_through(data):
     scan = open_recording(data / "kitti_object").frames[0].load()
     for version in VERSIONS:
         config = network_config(version, "compact")
-        found = PointPillarsDetector(TorchNetwork(lively(config)), Header(config), CPU)(scan)
-        assert found.problem is None and found.ms["network"] > 0
+        found = make_detector(TorchNetwork(lively(config)), Header(config))(scan)
+        assert found.problem is None and found.timings["network"] > 0

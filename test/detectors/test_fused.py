@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from pointnet_samples import random_detector as random_classifier
 
 from lidar_perception.classes import CAR
-from lidar_perception.detectors.base import Place
 from lidar_perception.detectors.boxes import (
     FRONT,
     MARGIN,
@@ -27,13 +26,14 @@ from lidar_perception.detectors.boxes import (
 )
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.devices import CPU
-from lidar_perception.detectors.fused.detector import FusedDetector, one_of_each
+from lidar_perception.detectors.fused.detector import FusedDetector, remove_duplicates
 from lidar_perception.detectors.fused.evidence import LEAST, clipped_logit
 from lidar_perception.detectors.fused.fusion import KNOTS, package_models
 from lidar_perception.detectors.fused.model import probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
-from lidar_perception.detectors.pointnet import detector as pointnet_detector
-from lidar_perception.detectors.view import without_carrier
+from lidar_perception.detectors.normalized_view import without_carrier
+from lidar_perception.detectors.pointnet import classifier
+from lidar_perception.detectors.trained_network import Placement
 from lidar_perception.geometry import bev_iou, points_in_box, points_in_boxes, wrap_angle
 from lidar_perception.ground.surface import MIN_POINTS, fit_ground_heights
 from lidar_perception.param_fields import with_values
@@ -173,21 +173,21 @@ def test_people_at_one_place_are_one_and_cars_do_not_share_any():
     found = Detections.of(boxes, ids, [0.5, 0.8, 0.9, 0.7, 0.95, 0.4, 0.3, 0.2])
     (car, person), (other, beside) = boxes[[4, 1]], boxes[[6, 7]]  # overlap by 4 % either
     assert min(bev_iou(car[None], other[None]), bev_iou(person[None], beside[None])) > 0.03
-    assert one_of_each(found, FusedParams()).tolist() == [4, 1, 3, 5, 7]
-    assert len(one_of_each(found[:0], FusedParams())) == 0
+    assert remove_duplicates(found, FusedParams()).tolist() == [4, 1, 3, 5, 7]
+    assert len(remove_duplicates(found[:0], FusedParams())) == 0
 
 
 @pytest.fixture(scope="module")
 def detector():
     eager = with_values(FusedDetectorParams(), {
         f"fused.scores.{name}": 0.0 for name in ("car", "pedestrian", "cyclist", "other")})
-    return FusedDetector(random_detector("v4"), random_classifier(), eager)
+    return FusedDetector(random_detector("v4").proposer, random_classifier().classifier, eager)
 
 
 def test_every_part_of_the_contract(detector):
     scan = frame()
     found = detector(scan)
-    assert len(found.detections) > 3 and tuple(found.ms) == STEPS
+    assert len(found.detections) > 3 and tuple(found.timings) == STEPS
     assert (np.diff(found.detections.scores) <= 0).all()
     assert same(detector(scan), found)  # nothing is left on it
     said = found.detections.sources
@@ -218,9 +218,9 @@ def test_a_higher_sensor_and_given_columns_change_nothing(detector):
     assert len(below) > 90
     np.testing.assert_allclose(above.boxes, below.boxes, atol=2e-3)
     np.testing.assert_allclose(above.scores, below.scores, atol=2e-3)
-    look = detector.look(scan)
+    proposals = detector.propose(scan)
     # Of what the network does not see nothing is asked.
-    ground = ~np.isin(scan.xyz.view("V12").ravel(), look.xyz.view("V12").ravel())
+    ground = ~np.isin(scan.xyz.view("V12").ravel(), proposals.obstacles.view("V12").ravel())
     assert same(detector(scan, ground=ground), found)
 
 
@@ -234,15 +234,15 @@ def test_an_intensity_that_is_left_out_is_as_one_that_is_not_there(detector):
     without = replace(scan, intensity=None)
     assert "no intensity" in detector(without).problem and other(without).problem is None
     assert same(other(scan), other(without)) and other(scan).problem is None
-    assert len(other.look(scan).ground) == len(detector.look(scan).ground)
+    assert len(other.propose(scan).ground) == len(detector.propose(scan).ground)
 
 
 def test_as_many_boxes_are_looked_at_as_asked_for_the_likeliest_ones(detector):
     whole, other = copy.copy(detector), copy.copy(detector)
     own = with_values(detector.params, {"fused.classifier_box": 0.0})
     whole.params, other.params = own, with_values(own, {"fused.max_proposals": 9})
-    every = whole.look(frame()).proposed
-    few = other.look(frame()).proposed  # but for what would carry the sensor
+    every = whole.propose(frame()).detections
+    few = other.propose(frame()).detections  # but for what would carry the sensor
     assert len(every) > 100 and 0 < len(few) <= 9 and same(few, every[:len(few)])
 
 
@@ -250,8 +250,8 @@ def test_boxes_are_halfway_between_both_networks(detector):
     def looked(share: float) -> tuple[np.ndarray, np.ndarray]:
         other = copy.copy(detector)
         other.params = with_values(detector.params, {"fused.classifier_box": share})
-        look = other.look(frame())
-        return look.proposed.boxes, np.isfinite(look.evidence["classifier"])
+        proposals = other.propose(frame())
+        return proposals.detections.boxes, np.isfinite(proposals.evidence["classifier"])
     (own, asked), (half, _), (judged, _) = (looked(share) for share in (0.0, 0.5, 1.0))
     assert asked.any() and not asked.all()
     np.testing.assert_array_equal((own != judged).any(axis=1), asked)
@@ -264,13 +264,13 @@ def test_a_car_close_to_a_sensor_that_it_does_not_carry_is_looked_at(detector, m
     """What carries the sensor depends on how high that is, and not on how high networks have it."""
     car = Detections.of([[0, 1.4, -0.98, 4, 1.6, 1.5, 0]], CAR, 0.9)  # 0.6 m aside
     monkeypatch.setattr(detector.proposer.__class__, "propose", lambda *_: Found(car))
-    assert len(detector.mounted_at(height).look(frame()).proposed) == stays
+    assert len(detector.mounted_at(height).propose(frame()).detections) == stays
 
 
 def test_it_says_so_when_a_part_had_to_leave_its_device(detector):
     other = copy.copy(detector)
     other.classifier = copy.copy(detector.classifier)
-    other.classifier.place = Place(CPU, "cuda is out of memory")
+    other.classifier.placement = Placement(CPU, "cuda is out of memory")
     assert other(frame()).problem == "cuda is out of memory" and detector(frame()).problem is None
 
 
@@ -278,10 +278,10 @@ def test_no_part_leaves_its_device_where_it_may_not(detector, monkeypatch):
     """What the node is told holds for both networks."""
     def predict(*_, **__):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
-    monkeypatch.setattr(pointnet_detector, "predict", predict)
+    monkeypatch.setattr(classifier, "predict", predict)
     other = copy.copy(detector)
     other.classifier = copy.copy(detector.classifier)
-    other.classifier.place = Place(torch.device("meta"))
+    other.classifier.placement = Placement(torch.device("meta"))
     other.params = with_values(detector.params, {"fused.cpu_fallback": False})
     with pytest.raises(InputError, match="meta is out of memory"):
         other(frame())

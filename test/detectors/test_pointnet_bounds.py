@@ -17,8 +17,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def test_small_and_large_clusters_and_many_are_no_trouble():
     rng = np.random.default_rng(0)
     detector = random_detector(with_values(eager(), {"pointnet.min_points": 1}))
-    detector.compiled, batches = None, []
-    detector.network.register_forward_hook(lambda net, given, _: batches.append(len(given[0])))
+    detector.classifier.compiled, batches = None, []
+    network = detector.classifier.network
+    network.register_forward_hook(lambda net, given, _: batches.append(len(given[0])))
     one = LidarFrame(np.float32([[9, 0, -1]]), np.ones(1, np.float32))
     assert len(detector(one, cluster_ids=np.ones(1, int)).detections) == 1
     xyz = rng.uniform([5, -3, -1.7], [9, 3, 2], (50_000, 3)).astype(np.float32)

@@ -80,15 +80,14 @@ def test_engine_torch_compiles_nothing(weights):
     for engine in "auto", "torch":
         detector = open_detector(weights, "cpu", settings={
             f"{weights}.warm_up": False, f"{weights}.engine": engine})
-        classifier = detector.classifier if weights == "fused" else detector
-        assert (classifier.compiled is not None) == (engine == "auto")
+        assert (detector.classifier.compiled is not None) == (engine == "auto")
 
 
-def test_detector_equals_torch():
-    detector = random_detector()
+def test_compiled_classifier_equals_torch():
+    classifier = random_detector().classifier
     clusters = blobs(np.random.default_rng(4), SIZES)
-    found = detector.predict(clusters)
-    detector.compiled = None
-    wanted = detector.predict(clusters)
+    found = classifier.predict(clusters)
+    classifier.compiled = None
+    wanted = classifier.predict(clusters)
     np.testing.assert_allclose(found.probabilities, wanted.probabilities, rtol=0, atol=1e-5)
     np.testing.assert_allclose(found.boxes, wanted.boxes, rtol=0, atol=TOLERANCE)

@@ -22,19 +22,15 @@ from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.checkpoint import Header, network_of, read_header, save_checkpoint
 from lidar_perception.detectors.checkpoint import Header as PointPillarsHeader
 from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.normalized_view import to_sensor_frame
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet import weights_file as weights_module
+from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.detector import PointNetDetector, load_pointnet_detector
 from lidar_perception.detectors.pointnet.network import load_pointnet
-from lidar_perception.detectors.pointnet.params import (
-    CLUSTERING,
-    GROUND,
-    STEPS,
-    PointNetDetectorParams,
-)
+from lidar_perception.detectors.pointnet.params import CLUSTERING, GROUND, STEPS
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
 from lidar_perception.detectors.pointpillars.network import load_network
-from lidar_perception.detectors.view import in_sensor_frame
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import level_points, segment_ground
 from lidar_perception.param_fields import with_values
@@ -124,9 +120,9 @@ def test_a_frame_without_clusters_has_no_detections_and_a_reason(ids):
             (scan, {"cluster_ids": np.arange(len(scan))}, "fewer than 3 points")):
         found = detector(cloud, **columns)
         assert len(found.detections) == 0 and words in found.problem, words
-        assert found.best == {} and list(found.ms) == list(STEPS)
+        assert found.best == {} and list(found.timings) == list(STEPS)
         found = detector(scan, cluster_ids=ids)
-        assert found.problem is None and found.ms["network"] > 0
+        assert found.problem is None and found.timings["network"] > 0
 
 
 # where the sensor is
@@ -164,7 +160,7 @@ def test_a_tilted_sensor_finds_the_same_boxes_in_its_own_frame(roll, pitch, ids)
                                             "pointnet.nms.iou": 1.0})
     seen = detector(replace(scan, xyz=scan.xyz @ back), cluster_ids=ids).detections
     detector.params = with_values(eager(), {"pointnet.nms.iou": 1.0})
-    assert alike(seen, in_sensor_frame(
+    assert alike(seen, to_sensor_frame(
         detector(scan, cluster_ids=ids).detections, pose), 2e-3) and len(found) > 3
 
 
@@ -212,8 +208,10 @@ def test_what_is_not_a_number_is_left_out_and_said(layer, ids):
     found = detector(replace(scan, intensity=intensity), cluster_ids=ids)
     assert same(found, expected)
     assert f"1 of {ids.max()} clusters" in found.problem and "NaN" in found.problem
-    getattr(detector.network, layer).bias.fill_(np.nan)
-    broken = PointNetDetector(detector.network, detector.header, CPU, detector.params)
+    network = detector.classifier.network
+    getattr(network, layer).bias.fill_(np.nan)
+    broken = PointNetDetector(PointNetClassifier(network, detector.classifier.header),
+                              detector.params)
     found = broken(scan, cluster_ids=ids)
     assert len(found.detections) == 0 and "NaN" in found.problem
 
@@ -244,7 +242,7 @@ def test_columns_of_another_length_are_refused():
 
 def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(ids, monkeypatch):
     """As if everything but the CPU had no memory."""
-    from lidar_perception.detectors.pointnet import detector as module
+    from lidar_perception.detectors.pointnet import classifier as module
     scan, expected, real = frame(), random_detector()(frame(), cluster_ids=ids), module.predict
     broken = random_detector()
 
@@ -253,11 +251,11 @@ def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(ids, monkey
             raise torch.cuda.OutOfMemoryError("CUDA out of memory")
         return real(network, clusters, **labels)
     monkeypatch.setattr(module, "predict", predict)
-    broken.place.device = torch.device("meta")
+    broken.classifier.placement.device = torch.device("meta")
     for _ in range(2):
         found = broken(scan, cluster_ids=ids)
         assert same(found, expected) and "CPU" in found.problem and broken.device == CPU
-    broken.place.device = torch.device("meta")
+    broken.classifier.placement.device = torch.device("meta")
     broken.params = with_values(eager(), {"pointnet.cpu_fallback": False})
     with pytest.raises(InputError, match="out of memory"):
         broken(scan, cluster_ids=ids)
@@ -333,7 +331,7 @@ def test_weights_of_another_network_or_other_classes_are_refused(saved, tmp_path
 
 def test_fewer_classes_are_found_as_what_they_are(ids):
     config = small(classes=("Pedestrian",), sizes=small().sizes[1:2])
-    found = PointNetDetector(lively(config), Header(config), CPU, eager())(
+    found = PointNetDetector(PointNetClassifier(lively(config), Header(config)), eager())(
         frame(), cluster_ids=ids).detections
     assert len(found) > 3 and {*found.class_ids} == {CLASSES.index("Pedestrian")}
 
@@ -349,7 +347,7 @@ def test_one_function_opens_both(saved, tmp_path):
     assert clustering == ablated.clustering != CLUSTERING
     for detector in pointnet, pointpillars:
         found = detector(frame())
-        assert found.ms["network"] > 0 and found.problem is None
+        assert found.timings["network"] > 0 and found.problem is None
     for name, words in ("none.safetensors", "no checkpoint"), ("none.onnx", "onnx"):
         with pytest.raises(InputError, match=words):
             open_detector(tmp_path / name)
@@ -386,6 +384,5 @@ def test_real_scans_of_any_network_go_through(data):
     scan = open_recording(data / "kitti_object").frames[0].load()
     for name in "improved", "pointnet", "pointnet2":
         config = small(name)
-        found = PointNetDetector(lively(config), Header(config), CPU,
-                                 PointNetDetectorParams())(scan)
-        assert found.problem is None and found.ms["network"] > 0
+        found = PointNetDetector(PointNetClassifier(lively(config), Header(config)))(scan)
+        assert found.problem is None and found.timings["network"] > 0

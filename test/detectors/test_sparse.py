@@ -9,21 +9,21 @@ import sys
 import numpy as np
 import pytest
 import torch
-from detection_samples import lively, random_detector, same, tiny
+from detection_samples import lively, make_detector, random_detector, same, tiny
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.checkpoint import Header
-from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.parallel import in_parts
+from lidar_perception.detectors.params import NmsParams
 from lidar_perception.detectors.pointpillars import sparse
 from lidar_perception.detectors.pointpillars.config import network_config
-from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
 from lidar_perception.detectors.pointpillars.expert import NetworkInput
 from lidar_perception.detectors.pointpillars.network import fused
 from lidar_perception.detectors.pointpillars.pillars import make_pillars
 from lidar_perception.detectors.pointpillars.sparse_layers import dilated, shrunk
+from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.param_fields import with_values
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.sensor import HDL64E
@@ -168,7 +168,7 @@ def test_weights_that_are_no_numbers_are_reported(layer):
     config = tiny("v4")
     network = lively(config)
     network.get_parameter(layer).fill_(torch.nan)
-    detector = PointPillarsDetector(TorchNetwork(network, engine="sparse"), Header(config), CPU)
+    detector = make_detector(TorchNetwork(network, engine="sparse"), Header(config))
     rng = np.random.default_rng(0)
     cloud = rng.uniform([2, -3, -1, 0], [6, 3, 0, 1], (200, 4)).astype(np.float32)
     found = detector(cloud, ground=np.zeros(200, bool), cluster_ids=np.zeros(200, int))
@@ -199,8 +199,7 @@ def test_engine_is_a_parameter(weights):
     quick = {f"{weights}.warm_up": False}
     for engine, expected in ("auto", True), ("sparse", True), ("torch", False):
         detector = open_detector(weights, "cpu", settings={**quick, f"{weights}.engine": engine})
-        proposer = detector.proposer if weights == "fused" else detector
-        assert (proposer.network.sparse is not None) == expected
+        assert (detector.proposer.network.sparse is not None) == expected
     with pytest.raises(InputError, match="engine"):
         open_detector("pointpillars", "cpu", settings={
             "pointpillars.warm_up": False, "pointpillars.engine": "sparse",
@@ -239,8 +238,9 @@ def test_detections_of_kitti_frames_equal_torch(data, both_engines):
 def test_detector_of_random_weights_equals_torch(version):
     detector = random_detector(version)
     detector.params = with_values(detector.params, {"pointpillars.nms.candidates": 5000})
-    other = PointPillarsDetector(TorchNetwork(lively(detector.config), engine="sparse"),
-                                 detector.header, CPU, detector.params)
+    header = detector.proposer.header
+    other = make_detector(TorchNetwork(lively(header.config), engine="sparse"), header,
+                          detector.params)
     rng = np.random.default_rng(3)
     cloud = rng.uniform([0, -5, -1.5, 0], [10, 5, 0.5, 1], (4000, 4)).astype(np.float32)
     columns = dict(ground=np.zeros(4000, bool), cluster_ids=rng.integers(0, 9, 4000))
@@ -251,11 +251,13 @@ def test_detector_of_random_weights_equals_torch(version):
 
 def test_a_cloud_without_a_pillar_detects_nothing():
     detector = random_detector("v4")
-    detector.network = TorchNetwork(lively(detector.config), engine="sparse")
+    proposer, config = detector.proposer, detector.proposer.config
+    proposer.network = TorchNetwork(lively(config), engine="sparse")
     broken = NetworkInput(np.full((10, 4), np.nan, np.float32),
-                          np.zeros((3, *detector.config.grid), np.uint8))
-    *_, detections, best, problem = detector._predict({False: broken})
-    assert len(detections) == 0 and best == {} and problem is None
+                          np.zeros((3, *config.grid), np.uint8))
+    _, predictions = proposer._predict({False: broken})
+    found = proposer._decode(predictions, [0.5] * 3, NmsParams())
+    assert len(found.detections) == 0 and found.best == {} and found.problem is None
 
 
 KERNEL = """

@@ -11,21 +11,17 @@ import zipfile
 import pytest
 import torch
 from click.testing import CliRunner
-from detection_samples import eager, frame, lively, random_detector, same, tiny
+from detection_samples import eager, frame, lively, make_detector, random_detector, same, tiny
 
 from lidar_perception.cli.main import cli
 from lidar_perception.detectors.checkpoint import Header, adopt, read_header, save_checkpoint
 from lidar_perception.detectors.pointpillars import weights_file as weights_module
 from lidar_perception.detectors.pointpillars.config import NetworkConfig, network_config
-from lidar_perception.detectors.pointpillars.detector import (
-    CPU,
-    PointPillarsDetector,
-    TorchNetwork,
-    load_detector,
-)
+from lidar_perception.detectors.pointpillars.detector import load_detector
 from lidar_perception.detectors.pointpillars.import_weights import import_weights
 from lidar_perception.detectors.pointpillars.network import load_network, make_network
 from lidar_perception.detectors.pointpillars.params import DetectorParams
+from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import InputError
 
@@ -60,7 +56,7 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
         torch.testing.assert_close(value, network.state_dict()[name], atol=1e-7,
                                    rtol=0 if value.ndim < 2 else 2**-10)
     found = load_detector(path, "cpu", eager(engine="torch"))(frame())
-    expected = PointPillarsDetector(TorchNetwork(network), header, CPU, eager())(frame())
+    expected = make_detector(TorchNetwork(network), header, eager())(frame())
     assert len(found.detections) and same(found, expected)
 
 
@@ -69,9 +65,9 @@ def test_a_checkpoint_of_another_network_is_refused_with_both_values(saved):
     with pytest.raises(InputError, match=r"version is v4, asked for was v2"):
         load_network(path, tiny("v2"))
     wanted = with_values(DetectorParams(), {"pointpillars.version": "v1"})
-    with pytest.raises(InputError, match=r"holds version v4, asked for was v1"):
+    with pytest.raises(InputError, match=r"has the version v4, not v1"):
         load_detector(path, "cpu", wanted)
-    with pytest.raises(InputError, match=r"holds size compact, asked for was full"):
+    with pytest.raises(InputError, match=r"has the size compact, not full"):
         load_detector(path, "cpu", with_values(DetectorParams(), {"pointpillars.size": "full"}))
 
 
@@ -169,8 +165,9 @@ def test_an_exported_network_finds_the_same(tmp_path):
     network, header = lively(config), Header(config, {"steps": 3})
     export_onnx(network, header, tmp_path / "n.onnx")
     exported = load_detector(tmp_path / "n.onnx", "auto", eager(score=0.1))
-    assert exported.header == header and isinstance(exported.network, OnnxNetwork)
-    expected = PointPillarsDetector(TorchNetwork(network), header, CPU, eager(score=0.1))(frame())
+    assert exported.proposer.header == header
+    assert isinstance(exported.proposer.network, OnnxNetwork)
+    expected = make_detector(TorchNetwork(network), header, eager(score=0.1))(frame())
     assert len(expected.detections) and same(exported(frame()), expected, 1e-4)
 
 

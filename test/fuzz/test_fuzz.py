@@ -76,7 +76,7 @@ def test_commands_survive_or_refuse_damaged_files():
 
 def test_a_node_says_that_its_curves_are_of_other_weights(nodes):
     fused = nodes["fused_detector"].node
-    assert "other weights than" in fused.counts["doubt"] == fused.detector.doubt
+    assert "other weights than" in fused.counts["doubt"] == fused.detector.warning
 
 
 @pytest.mark.no_cover

@@ -169,7 +169,7 @@ def test_cleanup_leaves_nothing_of_the_network(here, peer, weights):
     for stamp in (1, 2):
         drive(peer, NODE, "configure")
         held = [weakref.ref(thing) for thing in (
-            node.detector, node.detector.network, node.outputs, node.sensor)]
+            node.detector, node.detector.proposer.network, node.outputs, node.sensor)]
         drive(peer, NODE, "activate")
         peer.send(talker, message(stamp), lambda n=stamp: received(found, n), "detections")
         assert all(thing() is not None for thing in held)

@@ -213,5 +213,5 @@ def test_the_detector_of_either_network_is_told_how_high_the_sensor_is(made, con
                                                                       one_thread):
     save_checkpoint(tmp_path / "w", made.lively(config), Header(config))
     detector = open_detector(tmp_path / "w", "cpu", sensor_height=1.84)
-    assert detector.config == config
+    assert detector.networks[0].config == config
     assert detector.params.ground.sensor_pose.height == 1.84

@@ -8,9 +8,11 @@ import torch
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointpillars.config import NetworkConfig, network_config
-from lidar_perception.detectors.pointpillars.detector import CPU, PointPillarsDetector, TorchNetwork
+from lidar_perception.detectors.pointpillars.detector import CPU, PointPillarsDetector
 from lidar_perception.detectors.pointpillars.network import make_network
 from lidar_perception.detectors.pointpillars.params import DetectorParams
+from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
+from lidar_perception.detectors.pointpillars.torch_network import Network, TorchNetwork
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import Detections, LidarFrame
 
@@ -78,9 +80,13 @@ def eager(params: DetectorParams = DetectorParams(), score: float = 0.25,
 def random_detector(version: str = "v0", params: DetectorParams | None = None,
                     **changes) -> PointPillarsDetector:
     """With random weights."""
-    config = tiny(version, **changes)
-    return PointPillarsDetector(TorchNetwork(lively(config)), Header(config), CPU,
-                                params or eager())
+    return make_detector(TorchNetwork(lively(tiny(version, **changes))),
+                         Header(tiny(version, **changes)), params or eager())
+
+
+def make_detector(network: Network, header: Header, params: DetectorParams = DetectorParams(),
+                  device: torch.device = CPU) -> PointPillarsDetector:
+    return PointPillarsDetector(PointPillarsProposer(network, header, device), params)
 
 
 def same(a: Detections | Found, b: Detections | Found, atol: float = 0.0) -> bool:

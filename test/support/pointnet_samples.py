@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.config import PointNetConfig, pointnet_config
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
@@ -56,7 +57,7 @@ def random_detector(params: PointNetDetectorParams | None = None,
                     **changes) -> PointNetDetector:
     """With random weights."""
     config = small(**changes)
-    return PointNetDetector(lively(config), Header(config), CPU, params or eager())
+    return PointNetDetector(PointNetClassifier(lively(config), Header(config)), params or eager())
 
 
 def blobs(rng, sizes, spread=0.4):

@@ -14,6 +14,7 @@ from samples import CALIBRATION
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.config import pointnet_config
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
@@ -235,11 +236,12 @@ def test_clusters_equal_those_of_detector_at_scene_height(rng):
     things = fill_boxes(rng, small_boxes, 6).points
     points = np.concatenate([seen.points, things])
     scene = raise_scene(replace(seen, points=points, height=3.5), SENSOR_HEIGHT - 3.5)
-    detector = PointNetDetector(make_pointnet(CONFIG), Header(CONFIG), params=with_values(
+    classifier = PointNetClassifier(make_pointnet(CONFIG), Header(CONFIG), engine="torch")
+    read = []
+    classifier.network.register_forward_pre_hook(lambda _, inputs: read.append(len(inputs[0])))
+    detector = PointNetDetector(classifier, with_values(
         PointNetDetectorParams(ground=CONFIG.ground, clustering=CONFIG.clustering),
         {"ground.sensor_pose.height": scene.height, "pointnet.min_points": 5}))
-    detector.compiled, read = None, []
-    detector.network.register_forward_pre_hook(lambda _, inputs: read.append(len(inputs[0])))
     detector(LidarFrame(scene.points[:, :3].copy(), scene.points[:, 3].copy()))
     made = cut_clusters(scene, CONFIG, 5)
     assert sum(read) == (~made.loose).sum() > 3

@@ -18,7 +18,7 @@ from lidar_perception.camera import Camera
 from lidar_perception.classes import CAR, DETECTED
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import read_header, save_header
-from lidar_perception.detectors.fused.detector import FusedDetector, Look, load_fused_detector
+from lidar_perception.detectors.fused.detector import FusedDetector, Proposals, load_fused_detector
 from lidar_perception.detectors.fused.fusion import (
     KNOTS,
     PACKAGE,
@@ -105,7 +105,7 @@ def test_object_counts_once_and_van_does_not_count(camera: Camera | None):
     truth = GroundTruth.of(np.array([car, behind, person, van]),
                            [CAR, CAR, PEDESTRIAN, CLASSES.index("Van")])
     scan = frame()
-    look = Look(found, {"network": np.arange(7.0)}, scan.xyz, scan.xyz[:0], None, {})
+    look = Proposals(found, {"network": np.arange(7.0)}, scan.xyz, scan.xyz[:0], None, {})
     own = collect_samples(Frame.of("street", scan, truth, camera), look, 7)
     expected = {1.0: True, 2.0: True, 4.0: True, 5.0: False}
     if camera is not None:
@@ -150,7 +150,7 @@ def test_fusion_file_round_trip_in_moved_folder(others, tmp_path, monkeypatch):
 def test_package_curves_warn_about_other_weights(others):
     path, _ = others
     assert fusion_of().doubt is None and doubts(PACKAGE, 1.73) == []
-    assert open_detector("fused", "cpu").doubt is None
+    assert open_detector("fused", "cpu").warning is None
     other = str(proposer_file(PointPillarsParams(version="v1")))
     for params in FusedParams(weights=other), FusedParams(classifier=other):
         assert f"other weights than {other}" in fusion_of("", params).doubt
@@ -172,18 +172,19 @@ def test_missing_class_and_foreign_sensor_are_reported(others):
     never, other = doubts(path, 1.73)
     assert never.startswith("fused detects no Cyclist, as there are")
     assert str(classifier) in other and "the sensor vlp-16 at 0.6 m" in other
-    assert open_detector(path, "cpu").doubt == never
+    assert open_detector(path, "cpu").warning == never
 
 
 def test_detector_uses_its_own_curves_at_any_range(others):
     path, models = others
     loaded, package = load_fused_detector(path, "cpu"), load_fused_detector("", "cpu")
-    mine = FusedDetector(random_detector("v4"), loaded.classifier, loaded.params, models)
+    mine = FusedDetector(random_detector("v4").proposer, loaded.classifier, loaded.params, models)
     theirs = FusedDetector(mine.proposer, package.classifier, package.params)
     scan = frame()
     odds = [detector.with_min_score(0.0)(scan).detections for detector in (mine, theirs)]
     assert len(odds[0]) and not same(*odds)
-    assert mine.with_range("around").models is models and loaded.with_range("around").doubt is None
+    around = loaded.with_range("around")
+    assert around.models is loaded.models and around.warning is None
     half = with_values(loaded.params, {"fused.amp": "bf16", "fused.warm_up": False})
     assert load_fused_detector(path, "cpu", half).proposer.network.amp == "bf16"
 

@@ -1,4 +1,4 @@
-"""A cloud in, boxes out: PointPillars, the cluster network and silhouettes in one detector."""
+"""Fused detector: PointPillars proposes boxes, PointNet and silhouettes of clusters judge them."""
 
 from __future__ import annotations
 
@@ -10,207 +10,211 @@ from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from lidar_perception.classes import CAR
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.detectors.base import NetworkDetector
+from lidar_perception.detectors.base import NetworkDetector, make_synthetic_frame
 from lidar_perception.detectors.boxes import cars_on_points, moved_towards, on_ground
 from lidar_perception.detectors.contract import Found
-from lidar_perception.detectors.fused.evidence import Evidence, clipped_logit, judged, silhouette_at
+from lidar_perception.detectors.fused.evidence import Evidence, clipped_logit, silhouette_at
 from lidar_perception.detectors.fused.fusion import Models, fusion_of, package_models
 from lidar_perception.detectors.fused.model import at_most, probabilities, sources
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
-from lidar_perception.detectors.nms import first_of_each, suppressed
-from lidar_perception.detectors.params import ScoreParams
-from lidar_perception.detectors.pointnet.detector import PointNetDetector, load_pointnet_detector
-from lidar_perception.detectors.pointnet.params import PointNetDetectorParams, PointNetParams
-from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, load_detector
-from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
-from lidar_perception.detectors.view import (
-    as_found,
-    levelled_ground,
-    made_up_frame,
-    visible,
-    with_intensity_scaled,
+from lidar_perception.detectors.nms import keep_first, rotated_nms
+from lidar_perception.detectors.normalized_view import (
+    NormalizedView,
+    restore_detections,
+    segment_view_ground,
     without_carrier,
 )
+from lidar_perception.detectors.params import ScoreParams
+from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
+from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
+from lidar_perception.detectors.pointnet.params import PointNetDetectorParams, PointNetParams
+from lidar_perception.detectors.pointpillars.detector import load_detector
+from lidar_perception.detectors.pointpillars.expert import experts
+from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
+from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
+from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.geometry import bev_iou, centre_distances
-from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.surface import fit_ground_heights
-from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, LidarFrame
+from lidar_perception.types import CLASSES, Detections, LidarFrame
 
 
-class Look(NamedTuple):
-    """What is proposed in the network's range, in boxes that the classifier has put right where it
-    was asked, and what speaks for it; xyz (N, 3) of obstacles and ground (G, 3) there; why little
-    can be detected, or None; ms of each step."""
+class Proposals(NamedTuple):
+    """Proposed boxes in a NormalizedView with the evidence for them.
 
-    proposed: Detections
+    Attributes:
+        detections: K proposals; boxes that PointNet classified are moved towards its boxes.
+        evidence: log-odds (K,) of each source.
+        obstacles: (N, 3) xyz of the points of the view that are not ground.
+        ground: (G, 3) xyz of the ground points of the view.
+        problem: why nothing, or little, can be detected, or None.
+        timings: milliseconds of each step.
+    """
+
+    detections: Detections
     evidence: Evidence
-    xyz: np.ndarray
+    obstacles: np.ndarray
     ground: np.ndarray
     problem: str | None
-    ms: dict[str, float]
+    timings: dict[str, float]
 
 
 class FusedDetector(NetworkDetector):
-    """A detector, see contract.py, of what PointPillars detects, where its range is.
+    """A detector, see contract.py, made of two networks. Its range and classes are those of the
+    proposer. Ground and the clusters for PointPillars are computed where they are None.
 
-    proposer, classifier: loaded; their thresholds and mounting are this detector's. models: the
-    curves of what they say.
+    Args:
+        proposer, classifier: the networks. The curves of `models` were fitted to the proposer's
+            raw scores.
+        models: curves that turn evidence into probabilities; None: those of the package.
     """
 
-    group = "fused"  # of its params
+    group = "fused"
     params: FusedDetectorParams
 
-    def __init__(self, proposer: PointPillarsDetector, classifier: PointNetDetector,
+    def __init__(self, proposer: PointPillarsProposer, classifier: PointNetClassifier,
                  params: FusedDetectorParams = FusedDetectorParams(),
-                 models: Models | None = None):
-        super().__init__(proposer.header, proposer.device, params)
-        self.proposer, self.classifier = proposer.raw(), classifier  # the curves know raw scores
-        self.place = proposer.place
+                 models: Models | None = None, warning: str | None = None):
+        super().__init__(params, warning)
+        self.proposer, self.classifier = proposer.with_raw_scores(), classifier
         self.models = package_models() if models is None else models
 
     @property
+    def networks(self) -> tuple[TrainedNetwork, ...]:
+        return self.proposer, self.classifier
+
+    @property
     def settings(self) -> FusedParams:
-        """Its own group of params."""
         return self.params.fused
 
     def with_range(self, range: str) -> FusedDetector:
-        """See base; the range is that of PointPillars."""
-        other = FusedDetector(self.proposer.with_range(range), self.classifier, self.params,
-                              self.models)
-        other.doubt = self.doubt
+        other = copy.copy(self)
+        other.proposer = self.proposer.with_range(range)
         return other
+
+    def with_raw_scores(self) -> FusedDetector:
+        """Return this detector: its scores are not calibrated any further."""
+        return self
 
     def detect(self, frame: LidarFrame, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> Found:
-        """Ground and PointPillars' clusters are computed where they are None."""
-        look = self.look(frame, ground, cluster_ids, self.settings.scores)
+        proposals = self.propose(frame, ground, cluster_ids, self.settings.scores)
         begin = perf_counter()
-        detections, best = self.weighed(look)
-        detections = as_found(detections, self.params.ground.sensor_pose)
-        ms = {**look.ms, STEPS[-1]: (perf_counter() - begin) * 1e3}
-        return Found(detections, ms, look.problem or self.fallback or self.classifier.fallback,
-                     best)
+        detections, best = self.decide(proposals)
+        detections = restore_detections(detections, self.params.ground.sensor_pose)
+        timings = {**proposals.timings, STEPS[-1]: (perf_counter() - begin) * 1e3}
+        return Found(detections, timings, proposals.problem or self.fallback, best)
 
-    def look(self, frame: LidarFrame, ground: np.ndarray | None = None,
-             cluster_ids: np.ndarray | None = None,
-             scores: ScoreParams = ScoreParams.all_alike(0.0)) -> Look:
-        """What all sources say of a frame, before it is weighed. The classifier, which takes the
-        time, is asked only about proposals that can reach these scores with its help."""
+    def propose(self, frame: LidarFrame, ground: np.ndarray | None = None,
+                cluster_ids: np.ndarray | None = None,
+                min_scores: ScoreParams = ScoreParams.all_alike(0.0)) -> Proposals:
+        """Return the proposals for a cropped frame with the evidence of all sources.
+
+        Args:
+            min_scores: the classifier, which takes most time, skips proposals that cannot reach
+                these scores.
+        """
         times = [perf_counter()]
-        settings = self.settings
-        indices, seen = visible(frame, self.config, self.params.ground.sensor_pose)
-        seen = with_intensity_scaled(seen, settings.intensity_scale)
+        settings, params, config = self.settings, self.params, self.proposer.config
+        view = NormalizedView.of(frame, params.ground.sensor_pose, config.low, config.high,
+                                 settings.intensity_scale)
         times.append(perf_counter())
-        ground = (levelled_ground(seen, self.params.ground) if ground is None
-                  else ground.take(indices).astype(bool))
-        cluster_ids = None if cluster_ids is None else cluster_ids.take(indices)
-        obstacles = seen.take(np.flatnonzero(~ground))
-        floor = seen.xyz.compress(ground, axis=0)
+        is_ground = (segment_view_ground(view.frame, params.ground) if ground is None
+                     else ground.take(view.indices))
+        obstacles = view.frame.take(np.flatnonzero(~is_ground))
+        floor = view.frame.xyz.compress(is_ground, axis=0)
         times.append(perf_counter())
-        # Compiled code lets go of the GIL, and much of what PointPillars does is of one thread.
-        with ThreadPoolExecutor(1) as beside:
-            clustered = beside.submit(cluster_obstacles, seen.xyz, ground, self.params.people,
-                                      frame.xyz)
-            proposed = self._proposer().propose(seen, ground, cluster_ids)
-            people = clustered.result()[~ground]
+        # Compiled code releases the GIL, and much of PointPillars runs in one thread.
+        with ThreadPoolExecutor(1) as pool:
+            clusters = pool.submit(cluster_obstacles, view.frame.xyz, is_ground, params.people,
+                                   frame.xyz)
+            columns = experts(view.frame, config, is_ground, view.take(cluster_ids),
+                              params.ground, params.clustering)
+            found = self.proposer.propose(
+                view, *columns, ScoreParams.all_alike(settings.proposals),
+                replace(settings.nms, max_boxes=settings.max_proposals), settings.cpu_fallback)
+            people = clusters.result()[~is_ground]
         times.append(perf_counter())
-        found = without_carrier(proposed.detections, self.params.ground.sensor_pose.height)
-        evidence = {"network": clipped_logit(found.scores), "silhouette": clipped_logit(
-            silhouette_at(found.boxes, obstacles.xyz, floor, people))}
-        open_ = scores.passed(replace(found, scores=at_most(self.models, found.class_ids,
-                                                            evidence,
-                                                            "classifier")))
-        said, boxes = judged(found, obstacles, floor, self._classifier(), open_)
-        evidence["classifier"] = clipped_logit(said)
-        found = replace(found, boxes=moved_towards(found.boxes, boxes,
-                                                   settings.classifier_box).astype(np.float32))
+        proposed = without_carrier(found.detections, view.pose.height)
+        evidence = {"network": clipped_logit(proposed.scores), "silhouette": clipped_logit(
+            silhouette_at(proposed.boxes, obstacles.xyz, floor, people))}
+        limits = at_most(self.models, proposed.class_ids, evidence, "classifier")
+        probability, boxes = self.classifier.classify(
+            proposed, obstacles, floor, min_scores.passed(replace(proposed, scores=limits)),
+            settings.cpu_fallback)
+        evidence["classifier"] = clipped_logit(probability)
+        boxes = moved_towards(proposed.boxes, boxes, settings.classifier_box).astype(np.float32)
         times.append(perf_counter())
-        return Look(found, evidence, obstacles.xyz, floor,
-                    self.proposer.out_of_sight(frame, seen) or proposed.problem,
-                    dict(zip(STEPS, (np.diff(times) * 1e3).tolist())))
+        return Proposals(replace(proposed, boxes=boxes), evidence, obstacles.xyz, floor,
+                         found.problem, dict(zip(STEPS, (np.diff(times) * 1e3).tolist())))
 
-    def _proposer(self) -> PointPillarsDetector:
-        """The proposer, told what this detector is told; what it sees is level, and its intensity
-        scaled, already."""
-        settings, other = self.settings, copy.copy(self.proposer)
-        other.params = DetectorParams(
-            ground=replace(self.params.ground, sensor_pose=SensorPoseParams(height=SENSOR_HEIGHT)),
-            clustering=self.params.clustering,
-            pointpillars=PointPillarsParams(scores=ScoreParams.all_alike(settings.proposals),
-                                            nms=replace(settings.nms,
-                                                        max_boxes=settings.max_proposals),
-                                            intensity_scale=float(settings.intensity_scale > 0),
-                                            cpu_fallback=settings.cpu_fallback))
-        return other
-
-    def _classifier(self) -> PointNetDetector:
-        """Likewise."""
-        other = copy.copy(self.classifier)
-        own = replace(other.settings, cpu_fallback=self.settings.cpu_fallback)
-        other.params = replace(other.params, pointnet=own)
-        return other
-
-    def weighed(self, look: Look) -> tuple[Detections, dict[str, float]]:
-        """The detections, best first, as from a level sensor at SENSOR_HEIGHT, and where there are
-        none the highest score of each class."""
-        settings, class_ids = self.settings, look.proposed.class_ids
-        every = replace(look.proposed, scores=probabilities(self.models, class_ids, look.evidence),
-                        sources=sources(self.models, class_ids, look.evidence))
-        found = every[settings.scores.passed(every)]
+    def decide(self, proposals: Proposals) -> tuple[Detections, dict[str, float]]:
+        """Return the proposals that are detections, best first, in the coordinates of the view;
+        without any, also the highest score of each class."""
+        settings, class_ids = self.settings, proposals.detections.class_ids
+        scored = replace(proposals.detections,
+                         scores=probabilities(self.models, class_ids, proposals.evidence),
+                         sources=sources(self.models, class_ids, proposals.evidence))
+        found = scored[settings.scores.passed(scored)]
         if len(found) == 0:
             return found, {
-                name: float(every.scores[every.class_ids == CLASSES.index(name)].max(initial=0.0))
+                name: float(scored.scores[class_ids == CLASSES.index(name)].max(initial=0.0))
                 for name in self.classes}
-        boxes = cars_on_points(found.boxes, found.class_ids, look.xyz, settings.on_points)
-        floors = fit_ground_heights(look.ground, boxes[:, :2])
-        moved = replace(found, boxes=on_ground(boxes, floors, settings.on_ground).astype(
+        boxes = cars_on_points(found.boxes, found.class_ids, proposals.obstacles,
+                               settings.on_points)
+        heights = fit_ground_heights(proposals.ground, boxes[:, :2])
+        moved = replace(found, boxes=on_ground(boxes, heights, settings.on_ground).astype(
             np.float32))
-        return moved[one_of_each(moved, settings)], {}
-
-    def bring_to(self, device: torch.device) -> None:
-        """Bring both networks to a device."""
-        self.proposer.bring_to(device)
-        self.classifier.move(device)
+        return moved[remove_duplicates(moved, settings)], {}
 
     def warm_up(self) -> None:
-        """Run every part once on made-up points, so that what is compiled is compiled."""
-        self.with_min_score(0.0)(made_up_frame(self.params.ground.sensor_pose))
+        """Run every step once on synthetic points to trigger JIT compilation."""
+        self.with_min_score(0.0)(make_synthetic_frame(self.params.ground.sensor_pose))
 
 
-def one_of_each(found: Detections, params: FusedParams) -> np.ndarray:
-    """(M,) int64 indices, best score first, of the detections that are not a better one of their
-    class once more: by their overlap, of which cars may have hardly any, while people walk side by
-    side; but for cars by the distance of their centres, too."""
-    order = suppressed(found.boxes, found.scores, found.class_ids, params.nms.iou,
-                       params.nms.across_classes)
-    boxes, class_ids = found.boxes[order], found.class_ids[order]
-    again = (centre_distances(boxes, boxes) < params.same_place) & (class_ids[:, None] == class_ids)
+def remove_duplicates(detections: Detections, params: FusedParams) -> np.ndarray:
+    """Return the indices (M,) int64 of one detection per object, best score first.
+
+    Two detections of a class are one object if they overlap by more than nms.iou. Cars are already
+    one if they overlap by more than same_car; people walk side by side, so they and cyclists are
+    one if their centres are closer than same_place.
+    """
+    order = rotated_nms(detections.boxes, detections.scores, detections.class_ids,
+                        params.nms.iou, params.nms.across_classes)
+    boxes, class_ids = detections.boxes[order], detections.class_ids[order]
+    duplicate = ((centre_distances(boxes, boxes) < params.same_place)
+                 & (class_ids[:, None] == class_ids))
     cars = np.flatnonzero(class_ids == CAR)
-    again[cars] = False
-    again[np.ix_(cars, cars)] = bev_iou(boxes[cars], boxes[cars]) > params.same_car
-    return order[first_of_each(again)][:params.nms.max_boxes]
+    duplicate[cars] = False
+    duplicate[np.ix_(cars, cars)] = bev_iou(boxes[cars], boxes[cars]) > params.same_car
+    return order[keep_first(duplicate)][:params.nms.max_boxes]
 
 
 def load_fused_detector(path: str | Path = "", device: str = "auto",
                         params: FusedDetectorParams = FusedDetectorParams()) -> FusedDetector:
-    """The detector of a file of `train fused`, or with the weights of PointPillars at path; with an
-    empty one what params name, or else what comes with the package. InputError as of fusion_of,
-    load_detector and load_pointnet_detector."""
+    """Load the fused detector.
+
+    Args:
+        path: file of `train fused`, or weights of PointPillars; empty: what `params` name, or else
+            what comes with the package.
+
+    Raises:
+        InputError: see fusion_of, load_detector and load_pointnet_detector.
+    """
     settings = params.fused
     fusion = fusion_of(path, settings)
     proposer = load_detector(fusion.proposer, device, DetectorParams(
         pointpillars=PointPillarsParams(range=settings.range, amp=settings.amp, warm_up=False,
                                         threads=settings.threads, engine=settings.engine,
-                                        cpu_fallback=settings.cpu_fallback)))
+                                        cpu_fallback=settings.cpu_fallback))).proposer
     classifier = load_pointnet_detector(fusion.classifier, device, PointNetDetectorParams(
         pointnet=PointNetParams(warm_up=False, cpu_fallback=settings.cpu_fallback,
-                                engine="torch" if settings.engine == "torch" else "auto")))
-    detector = FusedDetector(proposer, classifier, params, fusion.models)
-    detector.doubt = "; ".join(fusion.doubts(detector.classes)) or None
+                                engine="torch" if settings.engine == "torch" else "auto"))
+    ).classifier
+    detector = FusedDetector(proposer, classifier, params, fusion.models,
+                             "; ".join(fusion.doubts(proposer.classes)) or None)
     if settings.warm_up:
         detector.warm_up()
     return detector

@@ -15,18 +15,12 @@ from lidar_perception.candidates.boxes import snap_to_ground
 from lidar_perception.candidates.confidence import compute_confidence, compute_shape_features
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.clustering.shapes import fit_boxes
-from lidar_perception.detectors.pointnet.clusters import points_of
-from lidar_perception.detectors.pointnet.detector import PointNetDetector
-from lidar_perception.detectors.pointnet.rescoring import class_probabilities, known
 from lidar_perception.geometry import centre_distances
 from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.groups import group_points
-from lidar_perception.types import Detections, LidarFrame
 
 HEIGHTS, LENGTH = (0.8, 2.6), 2.8  # metres, of clusters that may be a person or a cyclist
 SAME_PLACE = 0.6            # metres from the centre of a proposal to that of a cluster, at most
-MARGIN = 0.2                # metres around a proposal: its points, for the classifier
-FEWEST = 3                  # points that it says something of
 LEAST, MOST = 0.001, 0.999  # probabilities: no source is certain
 
 # By source, the log-odds (K,) float64 that each of K proposals is what it is proposed as; NaN where
@@ -48,21 +42,6 @@ def silhouette_at(boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray,
     own, start = group_points(xyz, cluster_ids, chosen + 1)
     confidences = compute_confidence(compute_shape_features(own, start, found[chosen], BEST))
     return (near * confidences).max(axis=1, initial=0.0)
-
-
-def judged(proposed: Detections, obstacles: LidarFrame, ground: np.ndarray,
-           classifier: PointNetDetector, open_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(K,) the probability of the class of each of K proposals, for the points in its box, and
-    (K, 7) the box that these points are of, if it is of that class; NaN where it is decided
-    already, not open_ (K,), where the classifier does not know the class, and where there are less
-    than FEWEST points."""
-    clusters = points_of(proposed.boxes, obstacles, MARGIN)
-    asked = np.flatnonzero(open_ & (clusters.sizes >= FEWEST)
-                           & known(classifier, proposed.class_ids))
-    clusters = clusters.take(asked).on(ground)
-    probabilities, boxes = np.full(len(proposed), np.nan), np.full((len(proposed), 7), np.nan)
-    probabilities[asked], boxes[asked] = class_probabilities(classifier, proposed[asked], clusters)
-    return probabilities, boxes
 
 
 def clipped_logit(probabilities: np.ndarray) -> np.ndarray:

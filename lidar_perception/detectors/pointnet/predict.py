@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from lidar_perception.detectors.nms import best_of_each
+from lidar_perception.detectors.nms import apply_nms
 from lidar_perception.detectors.params import NmsParams
 from lidar_perception.detectors.pointnet.box_head import decode
 from lidar_perception.detectors.pointnet.clusters import ClusterInput, Clusters, network_input
@@ -46,7 +46,7 @@ def found(predictions: Predictions, config: PointNetConfig, least: Sequence[floa
     overlap."""
     chosen = np.flatnonzero(predictions.scores >= np.asarray(least)[predictions.labels])
     chosen = chosen[np.argsort(-predictions.scores[chosen], kind="stable")][:nms.candidates]
-    return best_of_each(predictions.boxes[chosen], predictions.scores[chosen],
+    return apply_nms(predictions.boxes[chosen], predictions.scores[chosen],
                         predictions.labels[chosen], config.classes, nms)
 
 

@@ -15,9 +15,9 @@ from lidar_perception.classes import TABLE
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.clustering.shapes import classify_by_diagonal, fit_boxes, fit_ellipses
+from lidar_perception.detectors.normalized_view import segment_view_ground
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
-from lidar_perception.detectors.view import levelled_ground
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.groups import renumber_ids
 from lidar_perception.types import LidarFrame
@@ -41,7 +41,7 @@ def network_input(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | 
                   cluster_ids: np.ndarray | None = None,
                   ground_params: GroundParams = EXPERT_GROUND,
                   clustering: ClusteringParams = EXPERT_CLUSTERING) -> NetworkInput:
-    """The input arrays of a version, from the N points of `visible`.
+    """The input arrays of a version, from the N points of a NormalizedView.
 
     ground (N,) bool and cluster_ids (N,) int, 0 = none, are computed if the version needs them and
     they are None. The ids that are left are numbered anew from 1, in their order.
@@ -68,14 +68,14 @@ def experts(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | None =
             cluster_ids: np.ndarray | None = None, ground_params: GroundParams = EXPERT_GROUND,
             clustering: ClusteringParams = EXPERT_CLUSTERING,
             ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """ground (N,) bool and cluster_ids (N,) int of the N points of `visible`, computed where they
-    are None and the version needs them; ids are None where it needs none."""
+    """ground (N,) bool and cluster_ids (N,) int of the N points of a NormalizedView, computed where
+    they are None and the version needs them; ids are None where it needs none."""
     needs_clusters = config.cluster_ids or config.pseudo_map
     if not needs_clusters:
         cluster_ids = None
     missing = needs_clusters and cluster_ids is None
     if ground is None and (config.remove_ground or missing):
-        ground = levelled_ground(seen, ground_params)
+        ground = segment_view_ground(seen, ground_params)
     if missing:
         assert ground is not None
         cluster_ids = cluster_obstacles(seen.xyz, ground, clustering)

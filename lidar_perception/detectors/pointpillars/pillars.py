@@ -52,7 +52,7 @@ def make_pillars(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillars:
     row = ((points[:, 1] - low[1]) / config.cell).long().clamp_(max=height - 1)
     cells = (sample * height + row) * width + column
     if config.max_points:
-        kept = first_of_each(cells, config.max_points)
+        kept = keep_first_per_cell(cells, config.max_points)
         points, cells, column, row = points[kept], cells[kept], column[kept], row[kept]
     middle = torch.stack([points[:, 0] - ((column + 0.5) * config.cell + low[0]),
                           points[:, 1] - ((row + 0.5) * config.cell + low[1]),
@@ -108,7 +108,7 @@ def _of_one_cloud(cloud, low, high, cell, height, width, most, columns):
     return points[:count].copy(), offsets[:count].copy(), cells[:count].copy()
 
 
-def first_of_each(cells: Tensor, count: int) -> Tensor:
+def keep_first_per_cell(cells: Tensor, count: int) -> Tensor:
     """Ascending indices (M,) of the first `count` points of each cell, in the cloud's order."""
     ordered, indices = torch.sort(cells, stable=True)
     _, sizes = torch.unique_consecutive(ordered, return_counts=True)

@@ -143,7 +143,7 @@ def _name(detector: NetworkDetector | CustomDetector, taken: Sequence[str]) -> s
     if isinstance(detector, CustomDetector):
         name = detector.name
     elif detector.group in NETWORKS:
-        name = f"{NETWORKS[detector.group][0]} {detector.config.title}".strip()
+        name = f"{NETWORKS[detector.group][0]} {detector.networks[0].config.title}".strip()
     else:
         name = detector.group
     base, number = name, 2

@@ -199,7 +199,8 @@ def propose_boxes(frame: LidarFrame, proposer: Path) -> np.ndarray:
 def _load_proposer(path: Path) -> PointPillarsDetector:
     """Load a proposer with the lowest score that `fused` uses, once in each process."""
     params = DetectorParams(pointpillars=PointPillarsParams(warm_up=False))
-    return load_detector(path, "cpu", params).raw().with_min_score(FusedParams().proposals)
+    return load_detector(path, "cpu", params).with_raw_scores().with_min_score(
+        FusedParams().proposals)
 
 
 def drop_touching(found: np.ndarray, boxes: np.ndarray) -> np.ndarray:

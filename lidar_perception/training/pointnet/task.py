@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from lidar_perception.camera import Calibration
+from lidar_perception.detectors.normalized_view import restore_detections
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.box_head import BoxTargets, cluster_loss, encode
 from lidar_perception.detectors.pointnet.calibration import calibrate, calibration_error
@@ -25,7 +26,6 @@ from lidar_perception.detectors.pointnet.clusters import (
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import PointNet, make_pointnet
 from lidar_perception.detectors.pointnet.predict import found, outputs_of, predict
-from lidar_perception.detectors.view import as_found
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import show_progress
@@ -241,7 +241,7 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
     for scene in show_progress(scenes, "validating", len(scenes)):
         predictions.append(predict(network, scene.clusters))
         boxes = found(predictions[-1], config, [MIN_SCORE] * len(config.classes))
-        boxes = as_found(boxes, SensorPoseParams(height=scene.height))
+        boxes = restore_detections(boxes, SensorPoseParams(height=scene.height))
         report.update(Detected(scene.name, scene.truth, boxes, scene.calibration))
     metrics, calibration = summarize_report(report, "bev", config.classes)
     known = (labels >= 0) & (sizes >= MIN_SCORED_POINTS)

@@ -16,10 +16,11 @@ from lidar_perception.classes import DONT_CARE
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Detector
+from lidar_perception.detectors.normalized_view import NormalizedView
 from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
-from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
+from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
 from lidar_perception.detectors.pointpillars.expert import network_input
 from lidar_perception.detectors.pointpillars.losses import detection_loss
 from lidar_perception.detectors.pointpillars.network import (
@@ -29,6 +30,7 @@ from lidar_perception.detectors.pointpillars.network import (
 )
 from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
 from lidar_perception.detectors.pointpillars.pillars import make_pillars
+from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
 from lidar_perception.detectors.pointpillars.targets import (
     BACKGROUND,
     IGNORED,
@@ -40,7 +42,7 @@ from lidar_perception.detectors.pointpillars.targets import (
     nearest_axis_iou,
     sparse,
 )
-from lidar_perception.detectors.view import visible
+from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.geometry import is_within
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import show_progress
@@ -139,7 +141,8 @@ class ScenePreparation:
             scene = paste_objects(scene, self._objects, self.augment, low, high, rng)
         scene = augment_scene(scene, self.augment, rng)
         frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
-        _, seen = visible(frame, self.config, SensorPoseParams(height=scene.height))
+        seen = NormalizedView.of(frame, SensorPoseParams(height=scene.height), self.config.low,
+                                 self.config.high).frame
         inputs = network_input(seen, self.config)
         if len(inputs.points) < 2:
             raise InputError("a scene has no point in the detection range")
@@ -286,8 +289,8 @@ def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batc
     reported: set[str] = set()
 
     def validate(module: PointPillars) -> Validation:
-        detector = PointPillarsDetector(TorchNetwork(module, device), Header(config), device,
-                                        VALIDATION_PARAMS)
+        proposer = PointPillarsProposer(TorchNetwork(module, device), Header(config), device)
+        detector = PointPillarsDetector(proposer, VALIDATION_PARAMS)
         report = validate_detector(detector, validation, batches.jobs)
         report_skipped(report.skipped, len(report.frames), reported)
         return summarize_report(report, params.score, config.classes)

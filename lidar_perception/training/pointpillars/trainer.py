@@ -15,9 +15,11 @@ import torch
 
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
-from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
+from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
 from lidar_perception.detectors.pointpillars.network import channels_last, make_network
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
+from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
+from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.training.cut_objects import CutObjects, cut_objects, join_databases
 from lidar_perception.training.data import Batches, Item, SceneReader, Stream
@@ -98,8 +100,8 @@ class PointPillarsTrainer:
             step = measure_step(network, make_loss(reduced, device), lambda: [
                 prepare_pasted(scene, np.random.default_rng(0)) for scene in chosen],
                 params, device)
-        detector = PointPillarsDetector(TorchNetwork(network, device), Header(self.config), device,
-                                        VALIDATION_PARAMS)
+        proposer = PointPillarsProposer(TorchNetwork(network, device), Header(self.config), device)
+        detector = PointPillarsDetector(proposer, VALIDATION_PARAMS)
         frame = find_readable_frame(self._make_reader(held_out), lambda frame: detect_in_frame(
             frame, detector).problem is None)
         whole = step * np.prod(self.config.grid) / np.prod(reduced.grid)

@@ -1,4 +1,4 @@
-"""The cluster network judges boxes of another detector by the points in them."""
+"""PointNet classifies boxes of another detector by the points in them."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 from candidate_samples import boxes_at, scene
 from pointnet_samples import random_detector
 
+from lidar_perception.detectors.pointnet.classifier import BOX_MARGIN_M
 from lidar_perception.detectors.pointnet.clusters import points_of
 from lidar_perception.detectors.pointnet.predict import predict
-from lidar_perception.detectors.pointnet.rescoring import class_probabilities, known
 from lidar_perception.geometry import points_in_box
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, LidarFrame
 
@@ -26,7 +26,7 @@ def frame():
     return LidarFrame(xyz, np.random.default_rng(1).uniform(0, 1, len(xyz)).astype(np.float32))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def proposals():
     """Return boxes on two people and a thing, and one without points."""
     boxes = boxes_at([(7, 2), (12, -5), (10.95, 9.5), (30, 30)])
@@ -34,7 +34,7 @@ def proposals():
     return Detections.of(boxes, [PEDESTRIAN, CAR, CAR, PEDESTRIAN], [0.9, 0.8, 0.5, 0.4])
 
 
-def test_clusters_are_the_points_in_each_box(frame, proposals):
+def test_clusters_are_points_in_each_box(frame, proposals):
     made = points_of(proposals.boxes, frame, 0.2)
     assert len(made) == len(proposals) and made.sizes[3] < 5 < made.sizes[:3].min()
     for i, box in enumerate(proposals.boxes):
@@ -47,22 +47,23 @@ def test_clusters_are_the_points_in_each_box(frame, proposals):
     assert len(points_of(proposals.boxes[:0], frame, 0.2)) == 0
 
 
-def test_each_proposal_is_judged_by_itself(frame, proposals):
-    classifier, asked = random_detector(), np.arange(3)
-    clusters = points_of(proposals.boxes, frame, 0.2)
-    scores, boxes = class_probabilities(classifier, proposals[asked], clusters.take(asked))
-    network = predict(classifier.network, clusters.take(asked))
-    columns = [classifier.config.classes.index(CLASSES[i]) for i in proposals.class_ids[asked]]
-    np.testing.assert_allclose(scores, network.probabilities[asked, columns], atol=1e-6)
-    turned = asked[::-1]
-    again = class_probabilities(classifier, proposals[turned], clusters.take(turned))
-    np.testing.assert_allclose(again[0], scores[::-1], atol=1e-5)
+def test_classifier_judges_each_proposal_by_itself(frame, proposals):
+    classifier, ground = random_detector().classifier, np.zeros((0, 3), np.float32)
+    every = np.ones(len(proposals), bool)
+    probabilities, boxes = classifier.classify(proposals, frame, ground, every)
+    predictions = predict(classifier.network, points_of(proposals.boxes[:3], frame, BOX_MARGIN_M))
+    columns = [classifier.classes.index(CLASSES[i]) for i in proposals.class_ids[:3]]
+    np.testing.assert_allclose(probabilities[:3], predictions.probabilities[np.arange(3), columns],
+                               atol=1e-6)
+    again = classifier.classify(proposals[::-1], frame, ground, every)
+    np.testing.assert_allclose(again[0], probabilities[::-1], atol=1e-5)
     np.testing.assert_allclose(again[1], boxes[::-1], atol=1e-4)
-    assert scores.dtype == boxes.dtype == np.float32
-    assert [len(a) for a in class_probabilities(classifier, proposals[:0], clusters.take(asked[:0]))
-            ] == [0, 0]
+    assert [len(a) for a in classifier.classify(proposals[:0], frame, ground, every[:0])] == [0, 0]
 
 
-def test_a_network_knows_its_own_classes():
-    known_to = known(random_detector(), np.array([PEDESTRIAN, VAN, CAR]))
-    assert known_to.tolist() == [True, False, True]
+def test_classifier_skips_unknown_classes_and_empty_boxes(frame, proposals):
+    proposals.class_ids[1] = VAN
+    selected = np.array([True, True, False, True])
+    for values in random_detector().classifier.classify(proposals, frame, frame.xyz[:0], selected):
+        judged = np.isfinite(values.reshape(4, -1)).all(axis=1)
+        assert judged.tolist() == [True, False, False, False]

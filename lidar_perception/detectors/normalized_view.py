@@ -1,0 +1,154 @@
+"""The view of a cloud that networks are trained on: as from a level sensor at SENSOR_HEIGHT."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidar_perception.classes import CAR
+from lidar_perception.geometry import wrap_angle
+from lidar_perception.ground.params import GroundParams, SensorPoseParams
+from lidar_perception.ground.segment import level_points, segment_ground
+from lidar_perception.intensity import MIN_POINTS
+from lidar_perception.types import SENSOR_HEIGHT, Detections, LidarFrame
+
+MAX_MAST_M = 1.0     # a car farther below the sensor passes under a gantry
+MAX_ROOF_GAP_M = 1.0  # less than half of a car's width and the gap to the next car
+
+Corner = tuple[float, float, float]  # of a range: x, y, z in metres
+
+
+@dataclass(frozen=True)
+class NormalizedView:
+    """A cloud as a level sensor SENSOR_HEIGHT above the ground would have measured it.
+
+    Attributes:
+        frame: the M points in the view, with scaled intensity.
+        indices: (M,) int64 of these points in `source`.
+        source: the cloud in the sensor's own coordinates, N points.
+        pose: mounting of the sensor of `source`.
+        intensity_scale: factor of the intensity; 0: the view has none.
+    """
+
+    frame: LidarFrame
+    indices: np.ndarray
+    source: LidarFrame
+    pose: SensorPoseParams
+    intensity_scale: float
+
+    @staticmethod
+    def of(source: LidarFrame, pose: SensorPoseParams = SensorPoseParams(),
+           low: Corner | None = None, high: Corner | None = None,
+           intensity_scale: float = 1.0) -> NormalizedView:
+        """Return the view of a cloud.
+
+        Args:
+            low, high: range of the view, low <= x y z < high; points outside and points that are
+                not finite are left out. None: all points are kept.
+            intensity_scale: factor of the intensity. With 0 the view has no intensity: zeros would
+                still be read, for example by Patchwork++, which removes dark points below the
+                ground as reflections.
+        """
+        shift = np.array([0, 0, pose.height - SENSOR_HEIGHT], np.float32)
+        xyz, indices, frame = level_points(source.xyz, pose), np.arange(len(source)), source
+        if low is not None and high is not None:
+            indices = _indices_in_range(xyz, np.array(low, np.float32) - shift,
+                                        np.array(high, np.float32) - shift)
+            frame, xyz = source.take(indices), xyz.take(indices, axis=0)
+        frame = replace(frame, xyz=xyz + shift,
+                        intensity=_scale_intensity(frame.intensity, intensity_scale))
+        return NormalizedView(frame, indices, source, pose, intensity_scale)
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def take(self, column: np.ndarray | None) -> np.ndarray | None:
+        """Return the values (M,) of a column (N,) of the source; None for None."""
+        return None if column is None else column.take(self.indices)
+
+    def intensity_problem(self) -> str | None:
+        """Return the problem if the cloud has no intensity that a network could read; None if it
+        has, or the view leaves the intensity out."""
+        intensity = self.source.intensity
+        if not self.intensity_scale or (intensity is not None and (
+                len(intensity) < MIN_POINTS or intensity.any())):
+            return None
+        lack = "has no intensity" if intensity is None else "has the intensity 0 everywhere"
+        return f"the cloud {lack}, which the network was trained with; it reads zeros"
+
+
+def _indices_in_range(xyz: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    with np.errstate(invalid="ignore"):
+        inside = np.ones(len(xyz), bool)
+        for axis in range(3):
+            inside &= (xyz[:, axis] >= low[axis]) & (xyz[:, axis] < high[axis])
+    return np.flatnonzero(inside)
+
+
+def _scale_intensity(intensity: np.ndarray | None, scale: float) -> np.ndarray | None:
+    return None if intensity is None or not scale else intensity * np.float32(scale)
+
+
+def crop_to_range(frame: LidarFrame, low: Corner, high: Corner) -> tuple[np.ndarray, LidarFrame]:
+    """Return the points of a frame with low <= x y z < high: their indices (M,) int64, and the
+    frame of them."""
+    indices = _indices_in_range(frame.xyz, np.array(low, np.float32), np.array(high, np.float32))
+    return indices, frame.take(indices)
+
+
+def segment_view_ground(frame: LidarFrame, params: GroundParams) -> np.ndarray:
+    """Return which points of the frame of a NormalizedView are ground, (M,) bool. The sensor pose
+    in `params` is not used."""
+    return segment_ground(frame, replace(params, sensor_pose=SensorPoseParams()))
+
+
+def restore_detections(detections: Detections, pose: SensorPoseParams) -> Detections:
+    """Return detections of a NormalizedView in the coordinates of a sensor with this pose, without
+    the vehicle that carries it."""
+    return to_sensor_frame(without_carrier(detections, pose.height), pose)
+
+
+def to_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detections:
+    """Return detections of a NormalizedView in the coordinates of a sensor with this pose."""
+    boxes = detections.boxes.copy()
+    boxes[:, 2] -= pose.height - SENSOR_HEIGHT
+    if pose.roll or pose.pitch:
+        rotation = level_points(np.eye(3, dtype=np.float32), pose).T
+        heading = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])], axis=1) @ rotation[:2]
+        boxes[:, :3] = boxes[:, :3] @ rotation
+        boxes[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
+    return replace(detections, boxes=boxes)
+
+
+def without_carrier(detections: Detections, height: float) -> Detections:
+    """Return the detections of a NormalizedView without the vehicle that carries the sensor.
+
+    Dropped are boxes that contain the sensor, or are less than MAX_MAST_M above or below it. As a
+    roof is seen in parts, cars below the sensor are dropped if they are less than MAX_ROOF_GAP_M to
+    the side of it.
+
+    Args:
+        height: real height of the sensor above the ground in metres.
+    """
+    x, y, z, length, width, box_height, yaw = detections.boxes.astype(np.float64).T
+    z = z - (height - SENSOR_HEIGHT)
+    along = np.abs(np.cos(yaw) * x + np.sin(yaw) * y) - length / 2
+    across = np.abs(np.cos(yaw) * y - np.sin(yaw) * x) - width / 2
+    distance = np.hypot(along.clip(0), across.clip(0))
+    is_roof = ((detections.class_ids == CAR) & (z + box_height / 2 < 0)
+               & (distance < MAX_ROOF_GAP_M))
+    is_carrier = ((distance == 0) | is_roof) & (np.abs(z) <= box_height / 2 + MAX_MAST_M)
+    return detections[~is_carrier] if is_carrier.any() else detections
+
+
+def rotate_half_turn(frame: LidarFrame) -> LidarFrame:
+    """Return the frame rotated by 180 degrees about z, without rounding."""
+    return replace(frame, xyz=frame.xyz * np.array([-1, -1, 1], np.float32))
+
+
+def rotate_boxes_half_turn(boxes: np.ndarray) -> np.ndarray:
+    """Return boxes (K, 7) rotated by 180 degrees about z."""
+    rotated = boxes * np.array([-1, -1, 1, 1, 1, 1, 1], boxes.dtype)
+    rotated[:, 6] = wrap_angle(rotated[:, 6] + np.pi)
+    return rotated

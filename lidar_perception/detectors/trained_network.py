@@ -1,0 +1,115 @@
+"""A trained network on a device, with the CPU as a fallback."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any, Protocol, Self, TypeVar
+
+import torch
+
+from lidar_perception.detectors.calibration import raw_score
+from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.devices import CPU
+from lidar_perception.types import InputError
+
+Result = TypeVar("Result")
+
+
+class Movable(Protocol):
+    """A network that can move to another device."""
+
+    def to(self, device: torch.device) -> Any: ...
+
+
+@dataclass
+class Placement:
+    """Where a network runs; fallback: why it runs on the CPU instead of the chosen device, or
+    None. All copies of a TrainedNetwork share it."""
+
+    device: torch.device
+    fallback: str | None = None
+
+
+class TrainedNetwork:
+    """Base class: a network in inference mode, the header of its weights, and its placement."""
+
+    def __init__(self, network: Movable, header: Header, device: torch.device):
+        self.network, self.header = network, header
+        self.placement = Placement(device)
+
+    @property
+    def config(self) -> Any:
+        """The config of the network, such as NetworkConfig or PointNetConfig."""
+        return self.header.config
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes that the network was trained to detect."""
+        return self.config.classes
+
+    @property
+    def device(self) -> torch.device:
+        return self.placement.device
+
+    def with_raw_scores(self) -> Self:
+        """Return the same network with its own scores instead of calibrated probabilities."""
+        return self._with_header(replace(self.header, calibration={}))
+
+    def _with_header(self, header: Header) -> Self:
+        other = copy.copy(self)
+        other.header = header
+        return other
+
+    def raw_scores(self, scores: Mapping[str, float]) -> list[float]:
+        """Return calibrated scores by class as the network's own scores, in the order of
+        `classes`."""
+        return [raw_score(name, scores[name], self.header.calibration) for name in self.classes]
+
+    def move(self, device: torch.device, cpu_fallback: bool = True) -> None:
+        """Run on another device from now on, or on the CPU if the device is out of memory.
+
+        Raises:
+            InputError: the device is out of memory, and `cpu_fallback` is False.
+        """
+        self.placement.device = device
+        try:
+            self.network.to(device)
+        except torch.cuda.OutOfMemoryError as error:
+            self._fall_back(error, cpu_fallback)
+
+    def run(self, work: Callable[[], Result], cpu_fallback: bool = True) -> Result:
+        """Return work(); call it again on the CPU if the device is out of memory.
+
+        Raises:
+            InputError: the device is out of memory, and `cpu_fallback` is False.
+        """
+        try:
+            return work()
+        except torch.cuda.OutOfMemoryError as error:
+            self._fall_back(error, cpu_fallback)
+            return work()
+
+    def _fall_back(self, error: Exception, cpu_fallback: bool) -> None:
+        if self.device == CPU or not cpu_fallback:
+            raise InputError(f"{self.device} is out of memory; use the CPU or a smaller network"
+                             ) from error
+        self.placement.fallback = (f"{self.device} is out of memory, so the network runs on the "
+                                   "CPU; close other programs and start again")
+        self.move(CPU)
+
+    def now(self) -> float:
+        """Return a time in seconds, after all work queued on the device is done."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        return perf_counter()
+
+    def best_scores(self, scores: Iterable[float]) -> tuple[dict[str, float], str | None]:
+        """Return the highest scores by class, for a cloud in which none reached its threshold, and
+        the problem if one is NaN."""
+        best = dict(zip(self.classes, scores))
+        return best, ("the network's scores are not numbers (NaN); the weights or the intensity "
+                      "are broken" if any(map(math.isnan, best.values())) else None)
