@@ -74,7 +74,7 @@ class Command(click.Command):
                                    ctx) from None
 
     def remedy(self, flag: str) -> str:
-        """Return what to say of an unknown flag, before the closest match is looked for."""
+        """Return the remedy for an unknown flag that an option knows; "" without one."""
         return next((text for param in self.params if isinstance(param, HelpfulOption)
                      and (text := param.instead_of(flag))), "")
 
@@ -83,7 +83,7 @@ class HelpfulOption(click.Option):
     """An option whose possible values are listed by `--NAME help`."""
 
     def asks_for_help(self, args: list[str]) -> bool:
-        """Return whether the words of a command line ask for the listing."""
+        """Return True if the command line asks for the listing."""
         return any(f"{flag}=help" in args or [flag, "help"] in [args[i:i + 2] for i in
                                                                 range(len(args))]
                    for flag in self.opts)
@@ -93,7 +93,7 @@ class HelpfulOption(click.Option):
         raise NotImplementedError
 
     def instead_of(self, flag: str) -> str:
-        """Return what to say of an unknown flag that this option stands for, or ""."""
+        """Return the remedy for an unknown flag that this option replaces; otherwise ""."""
         return ""
 
 

@@ -1,4 +1,4 @@
-"""convert: recordings to bags and data sets, labels from one format to another."""
+"""convert: turn recordings into bags and data sets, and labels into other formats."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def convert(source: Path | None, format: str, out: Path, data: Path | None, give
             raise click.UsageError(what)
     recording = opened(source if data is None else data, level=robot is None, split=split,
                        points=points)
-    seen = _seen(recording, robot, deskew)
+    seen = _make_frame_transform(recording, robot, deskew)
     if given_labels:
         _labels(source, recording, format, out, given, data is not None, detections, limit, force)
     elif format == MCAP and detections is None:
@@ -98,8 +98,11 @@ def convert(source: Path | None, format: str, out: Path, data: Path | None, give
         _dataset(source, recording, seen, format, out, detections, limit, force)
 
 
-def _seen(recording: Any, file: Path | None, deskew: bool) -> Callable[[Any], Any]:
-    """What makes of a frame what nodes with this parameter file see; nothing without one."""
+def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Callable[[Any], Any]:
+    """Return the function that levels and deskews a frame as nodes with this parameter file do.
+
+    Without a file and deskewing it returns the frame unchanged.
+    """
     if file is None and not deskew:
         return lambda frame: frame
     from lidar_perception.data import bag_frames, cloud_folder
@@ -109,23 +112,23 @@ def _seen(recording: Any, file: Path | None, deskew: bool) -> Callable[[Any], An
     from lidar_perception.data.levelled import SensorMount, level_frame
     robot = SensorMount()
     if file is not None:
-        robot, asked = _robot(file)
+        robot, asked = _read_mount(file)
         deskew = deskew or asked
     if not deskew:
         return partial(level_frame, mount=robot)
     from lidar_perception.data.bag import BagHandle
     from lidar_perception.data.bag_poses import BagPoses
     if not bag_frames.is_layout(recording.path):
-        raise InputError(f"{recording.path} is no bag, so that nothing says how its sensor moved, "
-                         "which --deskew needs")
+        raise InputError(f"{recording.path} is not a bag, so it has no odometry or TF, which "
+                         "--deskew needs")
     first = recording.frames[len(recording) // 2]
     poses = BagPoses(BagHandle(recording.path), first.load().frame_id).lookup
-    level_frame(first, robot, poses).load()  # what lacks in all of them is said at once
+    level_frame(first, robot, poses).load()  # fails early if a topic or a column is missing
     return partial(level_frame, mount=robot, poses=poses)
 
 
-def _robot(file: Path) -> tuple[Any, bool]:
-    """The data.levelled.Robot of a parameter file, and whether it asks for deskewing."""
+def _read_mount(file: Path) -> tuple[Any, bool]:
+    """Return the SensorMount of a parameter file, and whether it enables deskewing."""
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
     from lidar_perception.data.levelled import SensorMount
@@ -137,8 +140,8 @@ def _robot(file: Path) -> tuple[Any, bool]:
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
     if params == PipelineParams() and node == CloudNodeParams():
-        raise InputError(f"{file} says nothing of how the sensor is mounted; setup writes such a "
-                         "file")
+        raise InputError(f"{file} does not describe a mounting; give robot.param.yaml, which "
+                         "`setup` writes")
     if node.base_frame and params.crop.body:
         raise InputError(f"{file} has crop.body in '{node.base_frame}', its base_frame, as nodes "
                          "read it; leave base_frame out and give the box in the sensor's frame, "
@@ -163,7 +166,7 @@ def _bag(source: Path, recording: Any, seen: Callable[[Any], Any], out: Path, im
 
 
 def _on_topic(source: Path, recording: Any, topic: str) -> Any:
-    """DriveLabels of the boxes on a topic of a bag."""
+    """Return the boxes on a topic of a bag as DriveLabels."""
     from lidar_perception.data.open import split_topic
     from lidar_perception.labels.formats import bag
     return bag.read(split_topic(source)[0], recording.frames[:], topic)

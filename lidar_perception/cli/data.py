@@ -1,4 +1,4 @@
-"""The options of every verb that walks over labelled frames, and how it opens and scores them."""
+"""Options shared by the commands that read recordings or score labelled frames."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ MOST_JOBS = 16  # processes by default; as many feed a GPU
 
 
 def a_path(name: str, what: str, metavar: str = "FILE", **more: Any) -> Callable:
-    """An option that takes a path."""
+    """Return an option that takes a path."""
     return click.option(name, type=click.Path(path_type=Path), metavar=metavar, help=what, **more)
 
 
 class OutFile(click.Path):
-    """A file that is written when the work is done: what stands in its way is said before."""
+    """A file to write at the end of a command; refused at the start if it cannot be written."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
@@ -41,7 +41,7 @@ class OutFile(click.Path):
 
 
 def out_file(name: str, what: str, *names: str, **more: Any) -> Callable:
-    """An option that takes the path of a file to write."""
+    """Return an option that takes the path of a file to write."""
     return click.option(name, *names, type=OutFile(path_type=Path), metavar="FILE", help=what,
                         **more)
 
@@ -56,12 +56,12 @@ class OutFolder(click.Path):
 
 
 def out_folder(what: str, name: str = "--out", **more: Any) -> Callable:
-    """An option that takes the path of a folder to write into."""
+    """Return an option that takes the path of a folder to write into."""
     return click.option(name, type=OutFolder(path_type=Path), metavar="FOLDER", help=what, **more)
 
 
 def jobs_for_all_cores(what: str, least: int = 0) -> Callable:
-    """--jobs, of processes that do what is said and none of which changes the result."""
+    """Return the option --jobs, by default one process for each core; `what` starts its help."""
     return click.option("--jobs", type=click.IntRange(least),
                         default=lambda: min(count_cores(), MOST_JOBS), show_default=f"one for each "
                         f"core, {MOST_JOBS} at most", help=f"{what} The result is the same.")
@@ -117,8 +117,8 @@ browser_option = click.option("--open/--no-open", "browser", default=True,
 
 @dataclass(frozen=True)
 class Walk:
-    """What the options say of a walk over frames: which ones, where they are measured, and where
-    the scores go."""
+    """Options of a command that scores frames: which frames, in which processes, and the output
+    file."""
 
     data: Any  # a path, or several
     split: Path | None
@@ -129,12 +129,15 @@ class Walk:
 
     @property
     def here(self) -> bool:
-        """Whether all is done in this process."""
+        """True if all frames are scored in this process."""
         return self.jobs == 1 and self.dask is None
 
     def opened(self, needs: str | None, data: Path | None = None, **how: Any) -> Any:
-        """The recording, or another one at `data`; see opened(). InputError where it has not what
-        the verb needs, of data.frame.BOXES and so on."""
+        """Open the recording, or another one at `data`, see opened().
+
+        Raises:
+            InputError: no frame has what the command needs, such as data.frame.BOXES.
+        """
         recording = opened(data or self.data, split=self.split, **how)
         if needs is not None:
             recording.require(needs, click.get_current_context().command_path.partition(" ")[2])
@@ -147,7 +150,7 @@ class Walk:
              title=title)
 
     def write(self, content: dict) -> None:
-        """Write what was measured, if a file was asked for."""
+        """Write the scores as JSON if --json was given."""
         write_json(self.json_file, content)
 
 
@@ -206,7 +209,8 @@ def lost_labels(recording: Any) -> list[str]:
 
 
 def as_mounted(recording: Any, params: Any) -> Any:
-    """params with the height of the recording's sensor, unless they have another than KITTI's."""
+    """Return params with the sensor height of the recording, unless they set another than
+    KITTI's."""
     from lidar_perception.ground.params import set_sensor_height
     from lidar_perception.types import SENSOR_HEIGHT
     if params.ground.sensor_pose.height != SENSOR_HEIGHT:
@@ -215,12 +219,12 @@ def as_mounted(recording: Any, params: Any) -> Any:
 
 
 def write_json(path: Path | None, content: dict) -> None:
-    """Write what was measured, if a file was asked for."""
+    """Write the scores as JSON; nothing if path is None."""
     if path is not None:
         write_text(path, json.dumps(content, indent=1))
 
 
 def no_labels(recording: Any, skipped: list[str], what: str = "labels") -> InputError:
-    """That nothing was scored, with the first reason."""
+    """Return the error for a run that scored nothing, with the first reason."""
     reason = f" ({skipped[0]})" if skipped else ""
     return InputError(f"{recording.path}: no frame with {what}{reason}")

@@ -1,4 +1,4 @@
-"""demo: the main job, from a bag through the nodes to a score."""
+"""demo: replay a drive through the nodes, and score the result."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ REPLACED = ("drive", "result", "logs")    # by the next demo
 
 
 def _runs(detector: str) -> Runs:
-    """The detector that the nodes run, with its parameters."""
+    """Return the detector that the nodes run, with its parameters."""
     return (candidates_run(on_messages=True) if detector == CANDIDATES else
             runs_of(detector, on_messages=True))
 
@@ -146,7 +146,11 @@ def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: i
 
 
 def _make_room(out: Path, data: Path | None, detector: str) -> None:
-    """Remove what an earlier demo left in out. InputError where something else lies there."""
+    """Remove the results of an earlier demo in `out`.
+
+    Raises:
+        InputError: `out` holds other files.
+    """
     old = [out / name for name in REPLACED if (out / name).exists()]
     if old and not (out / RECORD).is_file():
         raise InputError(f"{old[0]} is there, and no {RECORD} beside it says that demo made it; "
@@ -160,13 +164,13 @@ def _make_room(out: Path, data: Path | None, detector: str) -> None:
 
 
 def _as_replayed(drive: Path, recording: Recording | None) -> Recording:
-    """The bag of a recording, whose sensor is as high as there, or else of a simulated drive."""
+    """Open the bag to replay, with the sensor height of the recording that it was made from."""
     return open_recording(drive, sensor_height=None if recording is None else
                           recording.frames[0].sensor_height)
 
 
 def _params_of(chosen: DetectorChoice, played: Recording) -> Any:
-    """The parameters of the nodes; compiles what they share, once instead of in each of them."""
+    """Return the parameters of the nodes, and compile their shared code once for all of them."""
     if chosen.weights == CANDIDATES:
         warm_up()
         return as_recorded(played, checked(PAPER, chosen.settings))
@@ -174,7 +178,7 @@ def _params_of(chosen: DetectorChoice, played: Recording) -> Any:
 
 
 def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
-    """The bag to replay: the one that was given, or one made of it, or of a simulated drive."""
+    """Return the bag to replay: as given, or made from a recording or a simulated drive."""
     if recording is not None and isinstance(recording.frames, BagFrames) and (
             recording.frames.points == POINTS and recording.frames.poses.needs_no_tf):
         return recording.path
@@ -191,7 +195,7 @@ def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
 
 
 def _print_detections(frames: Sequence[Answered], calibration: Any) -> dict:
-    """Say what was found, by class, against the labels that the camera sees; the scores."""
+    """Print and return the detection scores by class, for labels in the camera's view."""
     from lidar_perception.scoring.detections import Detected
     from lidar_perception.scoring.kitti.in_use import in_use, print_in_use
     from lidar_perception.scoring.kitti.report import DetectionReport
@@ -214,7 +218,7 @@ def _print_pace(content: dict, rate: float, clouds: int) -> None:
 
 
 def _print_tracks(frames: Sequence[Answered], calibration: Any, poses: str) -> dict:
-    """Say by class how many were tracked, how well, and with which poses; the scores."""
+    """Print and return the scores of the tracks by class, and the source of the poses."""
     from lidar_perception.scoring.tracking.from_bag import recorded_tracks
     from lidar_perception.scoring.tracking.tables import EGO
     result = recorded_tracks(frames, calibration)
@@ -233,7 +237,7 @@ def _print_tracks(frames: Sequence[Answered], calibration: Any, poses: str) -> d
 
 
 def _drawn(frames: Sequence[Answered], detector: str) -> dict[int, tuple[np.ndarray, Any]]:
-    """Stamp -> boxes of labels and the found objects, of classes that the detector can find."""
+    """Return {stamp: (boxes of labels, detected objects)} of the classes that are detected."""
     wanted = {CLASSES[PEDESTRIAN]} if detector == CANDIDATES else {*DETECTED}
     return {f.stamp_ns: (f.truth.boxes[[label in wanted for label in f.truth.labels]], f.found)
             for f in frames}
@@ -241,8 +245,7 @@ def _drawn(frames: Sequence[Answered], detector: str) -> dict[int, tuple[np.ndar
 
 def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
                height: float) -> bool:
-    """Draw the recorded frame with most hits, with its tracks, where there are any; False if no
-    frame has a label."""
+    """Draw the recorded frame with most hits, and its tracks; return False without labels."""
     from lidar_perception.nodes.replay.graph_replay import TRACKS
     from lidar_perception.rendering.colors import by_cluster
     from lidar_perception.rendering.files import write_png

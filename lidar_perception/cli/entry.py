@@ -1,4 +1,4 @@
-"""The command lidar-perception: `run NODE` waits for signals as a node does from its first line."""
+"""Entry point of lidar-perception; `run NODE` blocks signals early, as nodes do."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class LazyGroup(Group):
         return getattr(importlib.import_module(module), function)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """A command that is stopped ends with 130, as everywhere; click would say 1, an error."""
+        """Exit with code 130 on ctrl-C, as other programs do; click would exit with 1."""
         from lidar_perception.runs.terminal import show_input_warnings
         try:
             with show_input_warnings():

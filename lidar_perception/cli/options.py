@@ -46,7 +46,7 @@ class Runs:
 
 @dataclass(frozen=True)
 class Settings:
-    """The values of --config and --set, not checked against a detector yet."""
+    """Values of --config and --set, not yet checked against a detector."""
 
     config: Path | None
     given: tuple[tuple[str, str], ...]
@@ -82,7 +82,7 @@ class Settings:
 
 
 def _guess(name: str, known: Fields) -> str:
-    """The closest parameter, by its whole name or the end of it."""
+    """Return the end of a message: the parameter with the closest name, or with this last part."""
     inner = [each for each in known if each.startswith(f"{name}.")]
     if inner:
         return f", which is a group with {', '.join(inner)}"
@@ -91,7 +91,7 @@ def _guess(name: str, known: Fields) -> str:
 
 
 def _value(name: str, f: Field[Any], text: str) -> Any:
-    """The value of a parameter that is given as text."""
+    """Convert the text of a parameter to its type."""
     kind = f.metadata["item"] or type(f.default)
     try:
         if not isinstance(f.default, tuple):
@@ -124,7 +124,7 @@ class Assignment(click.ParamType):
 
 
 class SetOption(HelpfulOption):
-    """--set. runs: of the options that were given, what runs."""
+    """The option --set. runs: returns what runs for the options that were given."""
 
     def __init__(self, *args: Any, runs: Callable[[Mapping[str, Any]], list[Runs]], **more: Any):
         super().__init__(*args, **more)
@@ -168,7 +168,7 @@ def settings_options(runs: Callable[[Mapping[str, Any]], list[Runs]],
 
 
 def candidates_run(on_messages: bool = False) -> Runs:
-    """The pipeline of the STM-CPA paper; on_messages: in nodes."""
+    """Return the candidate pipeline with its parameters; on_messages: it runs in nodes."""
     return Runs(CANDIDATES, _read_here(collect_fields(PAPER), on_messages), CANDIDATE_NODES)
 
 
@@ -188,7 +188,11 @@ def parameter_options(defaults: Any, name: str = CANDIDATES,
 
 
 def checked(params: Any, values: Mapping[str, Any]) -> Any:
-    """params with these values. InputError where one is out of range."""
+    """Return params with these values.
+
+    Raises:
+        InputError: a name is unknown or a value is out of range.
+    """
     try:
         return with_values(params, dict(values))
     except ValueError as error:
@@ -196,14 +200,20 @@ def checked(params: Any, values: Mapping[str, Any]) -> Any:
 
 
 def weights_of(given: Mapping[str, Any]) -> list[str]:
-    """The detectors that the options name."""
+    """Return the values of --weights as a list."""
     weights = given.get("weights") or ()
     return [*map(str, weights)] if isinstance(weights, tuple) else [str(weights)]
 
 
 def runs_of(weights: str | Path, on_messages: bool = False) -> Runs:
-    """A detector that runs, by its name or its file of weights; on_messages: in a node. InputError
-    for an unknown one."""
+    """Return the detector of a value of --weights with its parameters.
+
+    Args:
+        on_messages: the detector runs in a node, so it has the parameters of input messages, too.
+
+    Raises:
+        InputError: there is no such detector.
+    """
     params = default_params(weights)
     name = str(weights)
     node = next((f"{f.name}_detector" for f in fields(params)
@@ -212,13 +222,13 @@ def runs_of(weights: str | Path, on_messages: bool = False) -> Runs:
 
 
 def _read_here(fields: Fields, on_messages: bool) -> Fields:
-    """Without the parameters of how messages are read, where there are none."""
+    """Return the fields without those of input messages, unless messages are read."""
     return {name: f for name, f in fields.items() if on_messages or not name.startswith("input.")}
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """The parameters of the tracker, named as in its node."""
+    """Parameters of the tracker, named as in its node."""
 
     tracking: TrackingParams = TrackingParams()
 
@@ -279,8 +289,11 @@ def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> 
 
 
 def detectors_options(function: Callable) -> Callable:
-    """Decorator: as detector_options, of none or several detectors, which the function gets as
-    detectors=(DetectorChoice(...), ...). A parameter must be of one of them at least."""
+    """Decorator: the options of detector_options for any number of detectors.
+
+    The function gets them as detectors=(DetectorChoice(...), ...). Each parameter of --set must
+    belong to at least one of them.
+    """
     @functools.wraps(function)
     def wrapper(*args: Any, weights: tuple[Path, ...], range: str, device: str,
                 settings: Settings, **kwargs: Any) -> Any:
@@ -300,15 +313,18 @@ def detectors_options(function: Callable) -> Callable:
 
 def chosen_detector(weights: str | Path, range: str, device: str, values: Mapping[str, Any],
                     params: Any = None) -> DetectorChoice:
-    """A detector with parameters that are checked now, before anything is read. params: its
-    defaults, where open_detector does not know it."""
+    """Return a detector to open later, with parameters that are checked now.
+
+    Args:
+        params: default parameters, for a detector that open_detector does not know.
+    """
     if values:
         checked(default_params(weights) if params is None else params, values)
     return DetectorChoice(str(weights), range, device, dict(values))
 
 
 def weights_option(default: str | None = None, multiple: bool = False) -> Callable:
-    """--weights, of one detector or of several."""
+    """Return the option --weights; with `multiple` it may be repeated."""
     more = " May be repeated." if multiple else f" Default: {default}." if default else ""
     return click.option(
         "--weights", type=click.Path(path_type=Path), metavar="FILE|NAME", multiple=multiple,
@@ -318,8 +334,11 @@ def weights_option(default: str | None = None, multiple: bool = False) -> Callab
 
 
 def read_config(path: Path, known: Any, nodes: Collection[str] | None = None) -> dict[str, Any]:
-    """Read a parameter file, see read_parameters, and print what may be misspelt in it. known: a
-    dataclass of parameters, or its fields."""
+    """Read a parameter file, see read_parameters, and print names that may be misspelt.
+
+    Args:
+        known: a dataclass of parameters, or its fields.
+    """
     fields = known if isinstance(known, Mapping) else collect_fields(known)
     values, lines = read_parameters(path, fields, nodes)
     _warn(path, lines)

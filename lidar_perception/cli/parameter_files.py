@@ -1,4 +1,4 @@
-"""ROS parameter files, as commands read them."""
+"""Reading of ROS parameter files by commands."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def read_parameters(path: Path, known: Fields, nodes: Collection[str] | None = N
             raise InputError(f"the configuration {path} is for candidates; there is no "
                              f"{others[0]} here, give a parameter file")
         return dict(named), []
-    content = _loaded(path)
+    content = _load(path)
     visited = count()
     values: dict[str, Any] = {}
     lines: list[str] = []
@@ -70,8 +70,7 @@ def read_parameters(path: Path, known: Fields, nodes: Collection[str] | None = N
     return values, [*lines, *misspelt(unknown)]
 
 
-def _loaded(path: Path) -> dict[Any, Any]:
-    """The content of a parameter file. InputError where it cannot be read."""
+def _load(path: Path) -> dict[Any, Any]:
     if not path.exists():
         raise InputError(f"cannot read the parameter file {path}: there is no such file"
                          + valid_names(str(path), CONFIGURATIONS))
@@ -97,8 +96,10 @@ def _wrong_level(name: str, known: Iterable[str]) -> str:
 
 def _dotted(path: Path, section: dict, visited: Iterator[int], prefix: str = "",
             depth: int = 0) -> Iterator[tuple[Any, Any]]:
-    """(dotted name, value); the name as it is where it is no text. visited counts all that is
-    looked at, as groups may be empty, and may be in each other by their anchors."""
+    """Yield (dotted name, value), with the name unchanged if it is not text.
+
+    visited counts the entries of all groups, because YAML anchors can nest groups without end.
+    """
     for key, value in section.items():
         if next(visited) >= MAX_NAMES or depth >= MAX_DEPTH:
             raise InputError(f"{path} has more than {MAX_NAMES} parameters, or groups in more than "

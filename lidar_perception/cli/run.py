@@ -1,4 +1,4 @@
-"""run: nodes where `ros2 run` is not installed."""
+"""run: start nodes where `ros2 run` is not installed."""
 
 from __future__ import annotations
 

@@ -114,8 +114,10 @@ def _print(rows: list[Any]) -> None:
 
 
 def _layouts(topic: str, frame: str) -> dict[str, str]:
-    """The layouts for RViz and Foxglove that come with the package, with this topic and frame; none
-    where they are not installed."""
+    """Return the package's layouts for RViz and Foxglove with this topic and frame.
+
+    Empty if the layouts are not installed.
+    """
     places = (Path(__file__).parents[2] / "config",  # of a checkout; else where it is installed
               *(p / "share/lidar_perception/config" for p in Path(__file__).parents))
     folder = next((p for p in places if (p / FILES[-1]).is_file()), None)

@@ -72,7 +72,7 @@ def given(*assignments) -> list[str]:
 
 
 def scores(content: dict) -> dict:
-    """What does not depend on the clock."""
+    """Return the scores without the run time."""
     return {k: v for k, v in content.items() if k != "ms"}
 
 
@@ -410,7 +410,7 @@ somebody_elses_node:
 
 
 def chosen(*arguments, tracking=False) -> dict:
-    """What a verb with detector_options gets."""
+    """Return the arguments of a command with detector_options."""
     made = {}
 
     @click.command(cls=Command)

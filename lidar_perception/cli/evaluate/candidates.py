@@ -18,8 +18,10 @@ from lidar_perception.runs.terminal import console, errors
 
 
 def as_recorded(recording: Any, params: PipelineParams) -> PipelineParams:
-    """params with the height of the recording's sensor, see as_mounted, and with the crop to the
-    camera off, and a note, if it has no camera."""
+    """Return params with the sensor height of the recording, see as_mounted.
+
+    Without a camera the crop to its view is turned off, and a note is printed.
+    """
     from lidar_perception.data.frame import CAMERA
     params = as_mounted(recording, params)
     if params.view.enabled and CAMERA not in recording.has:
@@ -63,7 +65,7 @@ def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
 
 
 def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> None:
-    """The frame with most pedestrians of those that have candidates."""
+    """Draw the frame with most pedestrians among those with candidates."""
     from lidar_perception.candidates.pipeline import find_candidates
     from lidar_perception.candidates.seeds import load_seed
     from lidar_perception.rendering.colors import by_cluster

@@ -18,7 +18,7 @@ from lidar_perception.types import InputError
 
 
 def _file(weights: Path | None) -> Path:
-    """The checkpoint of --weights. InputError if that is another detector."""
+    """Return the checkpoint of --weights; InputError if it is not one of PointNet."""
     kind, path = (POINTNET, None) if weights is None else kind_and_file(weights)
     if kind != POINTNET:
         raise InputError(f"{weights} is a detector {kind}; give a checkpoint of {POINTNET}")
@@ -26,7 +26,7 @@ def _file(weights: Path | None) -> Path:
 
 
 def _runs(weights: Path | None) -> Runs:
-    """Ground and clustering, with the parameters that the network was trained with."""
+    """Return ground and clustering with the parameters that the network was trained with."""
     fields = collect_fields(default_params(_file(weights)))
     return Runs("ground and clustering", {name: f for name, f in fields.items()
                                  if name.startswith(("ground.", "clustering."))},
