@@ -79,7 +79,7 @@ setup(
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["lidar_perception*", "lidar_studio*", "msg_utils*"]),
     package_data={
-        NAME: ["py.typed", "nodes/*.xml", "candidates/*.json", "*/*.html",
+        NAME: ["py.typed", "nodes/*.xml", "candidates/*.json", "*/*.html", "*/*/*.html",
                "simulation/sensors/*.yaml", "detectors/fused/*.json",
                "detectors/pointnet/weights/*", "detectors/pointpillars/weights/pointpillars_v4_*"],
         "lidar_studio": ["py.typed", "page/*"],

@@ -19,8 +19,8 @@ from lidar_perception.types import InputError
 
 FILES = ("sensor.yaml", "robot.param.yaml", "report.html", "lidar_perception.rviz",
          "foxglove_layout.json")
-COLORS = {"sure": "green", "fair": "default", "doubtful": "yellow"}
-HINT_TOLERANCE = 0.1  # metres
+COLORS = {"high": "green", "fair": "default", "low": "yellow"}
+HINT_TOLERANCE_M = 0.1
 
 
 @click.command(cls=Command)
@@ -39,8 +39,8 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
     """Measure a LiDAR, its mounting and the robot's body from unlabelled clouds.
 
     Writes sensor.yaml, which `simulate --sensor` and `train --sensor` take, robot.param.yaml for
-    the nodes, layouts for RViz and Foxglove, and report.html, which says how each value was
-    measured and how sure it is. Works best with some minutes of driving in open space.
+    the nodes, layouts for RViz and Foxglove, and report.html, which has the method and the
+    confidence of each value. Works best with some minutes of driving in open space.
 
     \b
     Examples:
@@ -48,17 +48,17 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
       lidar-perception simulate --sensor robot/sensor.yaml --out street
       lidar-perception run fused_detector --ros-args --params-file robot/robot.param.yaml
     """
-    there = [name for name in FILES if (out / name).exists()]
-    if there and not force:
-        raise InputError(f"{out / there[0]} exists already; give another folder or --force")
+    existing = [name for name in FILES if (out / name).exists()]
+    if existing and not force:
+        raise InputError(f"{out / existing[0]} exists already; give another folder or --force")
     from lidar_perception.data.raw_clouds import choose_clouds, open_clouds
-    from lidar_perception.sensor_setup.doubts import doubts
-    from lidar_perception.sensor_setup.files import params_yaml, sensor_yaml
-    from lidar_perception.sensor_setup.findings import findings
-    from lidar_perception.sensor_setup.measure import measured
-    from lidar_perception.sensor_setup.report import report_html
-    from lidar_perception.sensor_setup.scans import scan_of
-    from lidar_perception.sensor_setup.told import told_by
+    from lidar_perception.sensor_setup.measurement.measure import measure_sensor
+    from lidar_perception.sensor_setup.measurement.recorded_poses import read_recorded_poses
+    from lidar_perception.sensor_setup.measurement.scans import read_scan
+    from lidar_perception.sensor_setup.report.files import format_params, format_sensor
+    from lidar_perception.sensor_setup.report.page import format_page
+    from lidar_perception.sensor_setup.report.values import list_values
+    from lidar_perception.sensor_setup.report.warnings import find_warnings
 
     with show_scanning(data):
         clouds = open_clouds(data, topic)
@@ -72,7 +72,7 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
         task = bar.add_task("reading", total=len(chosen) + 2)
         for i in chosen:
             try:
-                found.append(scan_of(clouds.load(i), f"cloud {i} of {data}"))
+                found.append(read_scan(clouds.load(i), f"cloud {i} of {data}"))
                 numbers.append(i)
             except InputError as error:
                 skipped.append(str(error))
@@ -80,36 +80,38 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
         if not found:
             raise InputError(skipped[0])
         bar.update(task, description="measuring")
-        told = told_by(clouds.poses, numbers, clouds.stamps_ns)
-        m = measured(found, numbers, str(data), clouds.count, clouds.stamps_ns, told, height_hint)
+        recorded = read_recorded_poses(clouds.poses, numbers, clouds.stamps_ns)
+        m = measure_sensor(found, numbers, str(data), clouds.count, clouds.stamps_ns, recorded,
+                           height_hint)
         bar.update(task, description="drawing", advance=1)
-        texts = {"sensor.yaml": sensor_yaml(m), "robot.param.yaml": params_yaml(m)}
-        page = report_html(m, texts)
+        texts = {"sensor.yaml": format_sensor(m), "robot.param.yaml": format_params(m)}
+        page = format_page(m, texts)
     make_folder(out)
     for name, text in {**texts, "report.html": page,
-                       **_layouts(clouds.topic or "/points", m.scans[0].frame_id)}.items():
+                       **_layouts(clouds.topic or "/points", m.source.scans[0].frame_id)}.items():
         write_text(out / name, text)
-    _print(findings(m))
+    _print_values(list_values(m))
     for line in skipped:
         console.print(Text("left out", "yellow") + f": {line}")
-    for line in doubts(m) + _hint(m, height_hint):
-        console.print(Text("doubt", "yellow") + f": {line}")
+    for line in find_warnings(m) + _check_hint(m, height_hint):
+        console.print(Text("warning", "yellow") + f": {line}")
     console.print(f"{out}: {', '.join(name for name in FILES if (out / name).exists())}")
 
 
-def _hint(m: Any, height: float | None) -> list[str]:
-    if height is None or m.mount is None or abs(m.mount.height - height) < HINT_TOLERANCE:
+def _check_hint(m: Any, height: float | None) -> list[str]:
+    mount = m.mounting.mount
+    if height is None or mount is None or abs(mount.height - height) < HINT_TOLERANCE_M:
         return []
-    return [f"the sensor is {m.mount.height:.2f} m above the ground and not {height:g}: measure it "
-            "by hand, or look in the report at which plane was fitted"]
+    return [f"the sensor is {mount.height:.2f} m above the ground and not {height:g}: measure it "
+            "by hand, or check the fitted plane in the report"]
 
 
-def _print(rows: list[Any]) -> None:
+def _print_values(rows: list[Any]) -> None:
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("what", "value", "how sure"):
+    for name in ("what", "value", "confidence"):
         table.add_column(name, overflow="fold")
     for row in rows:
-        table.add_row(row.what, row.value, Text(row.sure, COLORS[row.sure]))
+        table.add_row(row.name, row.value, Text(row.confidence, COLORS[row.confidence]))
     console.print(table)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 
 def render_page(template: str, **values: Any) -> str:
-    """Render a template of the package, such as "sensor_setup/report.html".
+    """Render a template of the package, such as "sensor_setup/report/report.html".
 
     Templates extend runs/page.html. Values are escaped; a name without a value is an error.
     """

@@ -1,1 +1,1 @@
-"""Measures a LiDAR and its mounting from unlabelled clouds."""
+"""Measurement of a LiDAR and its mounting from clouds, and the files and the report about it."""

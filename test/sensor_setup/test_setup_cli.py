@@ -1,11 +1,11 @@
-"""The command: files that the other commands take, nothing overwritten, clear refusals."""
+"""The command setup: files that other commands read, nothing overwritten, clear errors."""
 
 import json
 
 import pytest
 import yaml
 from click.testing import CliRunner
-from tilted_samples import clouds_of
+from tilted_samples import simulate_clouds
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.cli.main import cli
@@ -22,7 +22,7 @@ def bag(tmp_path_factory):
     path = tmp_path_factory.mktemp("bags") / "drive"
     with BagWriter(path) as made:
         made.add_topic("/lidar/points", "sensor_msgs/msg/PointCloud2")
-        for i, msg in enumerate(clouds_of("vlp-16", 6)):
+        for i, msg in enumerate(simulate_clouds("vlp-16", 6)):
             made.write("/lidar/points", i * 10**8, msg)
     return path
 
@@ -39,12 +39,12 @@ def robot(bag, tmp_path_factory):
     out = tmp_path_factory.mktemp("setup") / "robot"
     result = run("--data", bag, "--out", out, "--height-hint", 1.2)
     assert result.exit_code == 0
-    assert "vlp-16" in result.output and "doubt: the sensor is 0.60 m above" in " ".join(
+    assert "vlp-16" in result.output and "warning: the sensor is 0.60 m above" in " ".join(
         result.output.split())
     return out
 
 
-def test_every_file_is_written_and_can_be_read(robot):
+def test_every_file_is_written_and_readable(robot):
     assert sorted(p.name for p in robot.iterdir()) == sorted(FILES)
     assert sensor_from_file(robot / "sensor.yaml").rings == 16
     params = with_values(PipelineParams(), read_config(robot / "robot.param.yaml",
@@ -62,7 +62,7 @@ def test_every_file_is_written_and_can_be_read(robot):
 
 
 @pytest.mark.no_cover
-def test_nothing_is_overwritten_unasked(robot, bag):
+def test_files_are_replaced_only_with_force(robot, bag):
     before = {p.name: p.read_bytes() for p in robot.iterdir()}
     with pytest.raises(InputError, match="--force"):
         run("--data", bag, "--out", robot)
@@ -71,7 +71,7 @@ def test_nothing_is_overwritten_unasked(robot, bag):
                "--force").exit_code == 0
 
 
-def test_simulate_takes_the_measured_sensor(robot, tmp_path):
+def test_simulate_accepts_measured_sensor(robot, tmp_path):
     result = CliRunner().invoke(cli, [
         "simulate", "--sensor", str(robot / "sensor.yaml"), "--frames", "1", "--format",
         "semantickitti", "--out", str(tmp_path / "street"), "--jobs", "1"])
@@ -80,7 +80,8 @@ def test_simulate_takes_the_measured_sensor(robot, tmp_path):
 
 def test_bad_input_leaves_no_file(tmp_path, bag):
     (tmp_path / "one.pcd").write_text("no cloud")
-    for data, named in ((tmp_path / "none", "there is no"), (tmp_path / "one.pcd", "no PCD file")):
+    for data, named in ((tmp_path / "none", "does not exist"),
+                        (tmp_path / "one.pcd", "not a readable PCD file")):
         with pytest.raises(InputError, match=named):
             run("--data", data, "--out", tmp_path / "robot")
     with pytest.raises(InputError, match="no topic"):

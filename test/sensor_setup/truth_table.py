@@ -1,4 +1,4 @@
-"""Print how far the measured sensors of tilted_samples.MOUNTS are from the truth:
+"""Print the errors of the measured sensors of tilted_samples.MOUNTS for docs/how-to/own-sensor.md.
 
     PYTHONPATH=.:test/support python test/sensor_setup/truth_table.py [--uneven]
 """
@@ -8,29 +8,31 @@ from __future__ import annotations
 import sys
 
 import numpy as np
-from tilted_samples import MOUNTS, clouds_of
+from tilted_samples import MOUNTS, simulate_clouds
 
-from lidar_perception.sensor_setup.measure import measured
-from lidar_perception.sensor_setup.scans import scan_of
+from lidar_perception.sensor_setup.measurement.measure import measure_sensor
+from lidar_perception.sensor_setup.measurement.scans import read_scan
 from lidar_perception.simulation.sensor import sensor_named
 
 SCANS = 6
 
 
 def row(name: str, even: bool) -> str:
-    """One row of the table."""
+    """Return one row of the table."""
     _, roll, pitch, height = MOUNTS[name]
     sensor = sensor_named(name)
-    scans = [scan_of(msg) for msg in clouds_of(name, SCANS, even)]
-    m = measured(scans, [0, 1, 10, 11, 20, 21], name, SCANS, None)
+    scans = [read_scan(msg) for msg in simulate_clouds(name, SCANS, even)]
+    m = measure_sensor(scans, [0, 1, 10, 11, 20, 21], name, SCANS, None)
     true = np.degrees(sensor.elevations)
-    off = np.abs(m.beams.elevations[:, None] - true).min(axis=1).max()
-    q = m.mount
-    return (f"| `{name}` | {height} m, {roll:g}, {pitch:g} | {len(m.beams.elevations)} by "
-            f"{m.beams.how}, {off:.4f} | {100 * (m.step * sensor.columns / 360 - 1):.2f} % | "
-            f"{100 * (q.height - height):.1f} cm | {np.degrees(q.roll) - roll:.2f}, "
-            f"{np.degrees(q.pitch) - pitch:.2f} | {100 * m.noise:.1f} of "
-            f"{100 * sensor.range_noise:.1f} cm | {m.model} |")
+    pattern, mount = m.pattern, m.mounting.mount
+    up = pattern.beams.elevations
+    error = np.abs(up[:, None] - true).min(axis=1).max()
+    step_error = pattern.azimuth_step * sensor.columns / 360 - 1
+    return (f"| `{name}` | {height} m, {roll:g}, {pitch:g} | {len(up)} by {pattern.beams.method}, "
+            f"{error:.4f} | {100 * step_error:.2f} % | {100 * (mount.height - height):.1f} cm | "
+            f"{np.degrees(mount.roll) - roll:.2f}, {np.degrees(mount.pitch) - pitch:.2f} | "
+            f"{100 * pattern.range_noise:.1f} of {100 * sensor.range_noise:.1f} cm | "
+            f"{pattern.model} |")
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ from lidar_perception.cli.simulate import simulate
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.semantickitti import MOVING
 from lidar_perception.data.to_bag import to_point_array
-from lidar_perception.sensor_setup.mount import mount_of
-from lidar_perception.sensor_setup.scans import scan_of
+from lidar_perception.sensor_setup.measurement.mount import measure_mount
+from lidar_perception.sensor_setup.measurement.scans import read_scan
 from lidar_perception.simulation.camera import worth_a_label
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.raycast import cast
@@ -150,8 +150,9 @@ def test_a_mix_takes_turns_and_is_trained_on():
 def test_setup_finds_the_height_indoors(kind):
     sensor = replace(sensor_named("vlp-16", 0.6), azimuth_step=float(np.radians(0.8)))
     frames = [scan_at(7, i, sensor, Scenes(kind, 1.0, "indoor")).frame for i in (0, 1, 90, 91)]
-    mount = mount_of([scan_of(from_array(to_point_array(frame), header(bag_message, frame.stamp_ns),
-                                         bag_message)) for frame in frames])
+    clouds = [from_array(to_point_array(frame), header(bag_message, frame.stamp_ns), bag_message)
+              for frame in frames]
+    mount = measure_mount([read_scan(cloud) for cloud in clouds])
     assert mount.height == pytest.approx(0.6, abs=0.02)
     assert np.degrees([mount.roll, mount.pitch]) == pytest.approx([0.0, 0.0], abs=0.2)
 

@@ -1,4 +1,4 @@
-"""Simulated clouds of sensors that lean, with a driver's columns: the truth for measuring them."""
+"""Simulated clouds of tilted sensors with the columns of real drivers, whose mount is known."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import header_message
 
-# name: sensor, roll and pitch in degrees, height; driver: names, types and units of its columns
+# Columns of a driver: name, type and scale.
 VELODYNE = dict(intensity=("intensity", "<f4", 255), ring=("ring", "<u2", -1),
                 time=("time", "<f4", 1))
 OUSTER = dict(intensity=("intensity", "<f4", 255), ring=("ring", "<u1", 1), time=("t", "<u4", 1e9))
@@ -25,24 +25,23 @@ HESAI = dict(intensity=("intensity", "u1", 255), ring=("channel", "<u2", 1),
              time=("time_stamp", "<u4", 1e9))
 KITTI = dict(intensity=("intensity", "<f4", 1), ring=None, time=None)
 BARE = dict(intensity=None, ring=None, time=None)
-EVEN = dict(camber=0.0, wave=0.0, rough=0.0, litter=0.0)  # of a street
-MOUNTS = {  # of eight sensors
+EVEN = dict(camber=0.0, wave=0.0, rough=0.0, litter=0.0)  # street without unevenness
+MOUNTS = {  # sensor: driver, roll and pitch in degrees, height in metres
     "hdl-64e": (KITTI, 1.5, -2.0, 1.73), "hdl-32e": (VELODYNE, -3.0, 4.0, 1.9),
     "vlp-16": (VELODYNE, 5.0, 8.0, 0.6), "vlp-32c": (VELODYNE, -6.0, -3.0, 1.1),
     "os1-64": (OUSTER, 2.0, 12.0, 1.4), "os1-128": (OUSTER, -1.0, 3.0, 0.8),
     "pandar64": (HESAI, 4.0, -1.0, 2.1), "pandarxt-32": (BARE, -2.5, 6.0, 0.9)}
 
 
-def turned(roll: float, pitch: float) -> np.ndarray:
-    """(3, 3) from the axes of a sensor mounted so, degrees, to level ones."""
+def tilt_matrix(roll: float, pitch: float) -> np.ndarray:
+    """Return (3, 3) from the axes of a sensor with this roll and pitch in degrees to level ones."""
     r, p = np.radians([roll, pitch])
     return np.array([[np.cos(p), 0, np.sin(p)], [0, 1, 0], [-np.sin(p), 0, np.cos(p)]]) @ np.array(
         [[1, 0, 0], [0, np.cos(r), -np.sin(r)], [0, np.sin(r), np.cos(r)]])
 
 
-def upright_on(ground: Ground, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What stands on the ground at (x, y): (3, 3) from its axes to the world's, whose z is the
-    normal of the road around, and the point of that plane there."""
+def find_road_pose(ground: Ground, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return axes (3, 3) with z along the normal of the road around (x, y), and its point there."""
     x, y = np.meshgrid(np.linspace(-6, 6, 25), np.linspace(-3, 3, 13))
     z = surface_height(ground._replace(curb_height=0.0), at[0] + x, at[1] + y)
     a, b, c = np.linalg.lstsq(np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]), z.ravel(),
@@ -53,30 +52,34 @@ def upright_on(ground: Ground, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @njit(cache=True)
-def _ground_hits(ground, start, way, since, velocity, lift, max_range):
-    """range, brightness, cosine and class (columns, rings) of the ground alone."""
-    out = np.empty((*way.shape[:2], 4))
-    for i in range(way.shape[0]):
-        for k in range(way.shape[1]):
+def _cast_ground(ground, start, direction, since, velocity, lift, max_range):
+    """Return range, brightness, cosine and class (columns, rings, 4) of the ground alone."""
+    out = np.empty((*direction.shape[:2], 4))
+    for i in range(direction.shape[0]):
+        for k in range(direction.shape[1]):
             at = start + velocity * since[i] + lift[k]
             hit = cast_ground(ground, (at[0], at[1], at[2]),
-                              (way[i, k, 0], way[i, k, 1], way[i, k, 2]), max_range)
+                              (direction[i, k, 0], direction[i, k, 1], direction[i, k, 2]),
+                              max_range)
             out[i, k, 0], out[i, k, 1] = hit.range, hit.brightness
             out[i, k, 2], out[i, k, 3] = hit.cosine, hit.semantic
     return out
 
 
-def tilted(sensor: Sensor, roll: float, pitch: float, street: int, number: int, even: bool = True):
-    """Returns of one turn of a sensor that leans against the road beneath it, degrees, at
-    sensor.height above it; even: streets slope and have curbs, and are smooth otherwise."""
+def simulate_tilted(sensor: Sensor, roll: float, pitch: float, street: int, number: int,
+                    even: bool = True):
+    """Return the returns of one turn of a sensor with roll and pitch in degrees against the road.
+
+    even: the street has slopes and curbs, but is smooth otherwise.
+    """
     scene = drive._scene(street, ANY)
     ground = scene.ground._replace(**EVEN) if even else scene.ground
     scene = replace(scene, ground=ground)
     sensor = sensor.at_turn(number)
     moment = scene.at(number / sensor.rate, sensor.height)
-    stand, foot = upright_on(ground, moment.position[:2])
-    position = foot + sensor.height * stand[:, 2]
-    world = stand @ turned(roll, pitch)
+    axes, foot = find_road_pose(ground, moment.position[:2])
+    position = foot + sensor.height * axes[:, 2]
+    world = axes @ tilt_matrix(roll, pitch)
     solids = replace(moment.solids, centre=(moment.solids.centre + moment.position - position)
                      @ world, axes=world.T @ moment.solids.axes,
                      velocity=moment.solids.velocity @ world)
@@ -84,7 +87,7 @@ def tilted(sensor: Sensor, roll: float, pitch: float, street: int, number: int, 
     hits = cast(solids, Ground(), np.array([0.0, 0.0, 1e6]), sensor, motion, street)
     made = rays(sensor, motion)
     lift = np.outer(sensor.lifts or np.zeros(sensor.rings), world[:, 2])
-    on_ground = _ground_hits(compiled(ground), position, made.direction @ world.T, made.since,
+    on_ground = _cast_ground(compiled(ground), position, made.direction @ world.T, made.since,
                              np.array(moment.motion.velocity), lift, sensor.max_range)
     nearer = on_ground[..., 0] < hits.range
     merged = [np.where(nearer, on_ground[..., i], part)
@@ -95,9 +98,8 @@ def tilted(sensor: Sensor, roll: float, pitch: float, street: int, number: int, 
                       np.random.default_rng([street, number]), compensated=False)
 
 
-def cloud(returns, driver: dict, stamp_ns: int, rings: int, frame_id: str = "lidar"):
-    """The returns as a PointCloud2 with a driver's columns, firing by firing where it gives times
-    or nothing, beam by beam where it is KITTI's."""
+def make_cloud(returns, driver: dict, stamp_ns: int, rings: int, frame_id: str = "lidar"):
+    """Return a PointCloud2 with a driver's columns: beam by beam for KITTI, else by firings."""
     order = np.arange(len(returns.xyz)) if driver is KITTI else np.argsort(
         returns.time, kind="stable")
     columns = {axis: returns.xyz[order, i] for i, axis in enumerate("xyz")}
@@ -118,11 +120,11 @@ def cloud(returns, driver: dict, stamp_ns: int, rings: int, frame_id: str = "lid
     return from_array(points, header_message(stamp_ns, frame_id, bag_message), bag_message)
 
 
-def clouds_of(name: str, count: int = 4, even: bool = True, street: int = 40):
-    """Clouds of the sensor of that name on its mount of MOUNTS, pairs on streets of their own."""
+def simulate_clouds(name: str, count: int = 4, even: bool = True, street: int = 40):
+    """Yield clouds of a sensor on its mount of MOUNTS, each pair on another street."""
     driver, roll, pitch, height = MOUNTS[name]
     sensor = replace(sensor_named(name), height=height)
     for i in range(count):
-        found = tilted(sensor, roll, pitch, street + i // 2, 20 + i % 2, even)
-        yield cloud(found, driver, round(1e9 * (10 * (i // 2) + (i % 2) / sensor.rate)),
-                    sensor.rings)
+        returns = simulate_tilted(sensor, roll, pitch, street + i // 2, 20 + i % 2, even)
+        yield make_cloud(returns, driver, round(1e9 * (10 * (i // 2) + (i % 2) / sensor.rate)),
+                         sensor.rings)

@@ -1,4 +1,4 @@
-"""The pictures of the report, as PNG bytes, drawn with Matplotlib."""
+"""Pictures of the report, drawn with Matplotlib as PNG bytes."""
 
 from __future__ import annotations
 
@@ -14,34 +14,36 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.robot.crop import crop_frame
 from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.robot.poses import transform_points
-from lidar_perception.sensor_setup.files import chosen_params
-from lidar_perception.sensor_setup.measure import Measured
-from lidar_perception.sensor_setup.scans import RETROREFLECTOR
+from lidar_perception.sensor_setup.measurement.measure import SensorMeasurement
+from lidar_perception.sensor_setup.measurement.scans import RETROREFLECTOR
+from lidar_perception.sensor_setup.report.params import choose_params
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.types import LidarFrame
 
 BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#999999"  # Okabe and Ito, 2008
-MAX_DRAWN = 40_000  # points
-SIZE = (9.0, 4.0)   # inches
+MAX_DRAWN_POINTS = 40_000
+FIGURE_SIZE = (9.0, 4.0)  # inches
+GROUND_RADIUS_M = 25.0  # of the drawn ground
 
 
-def drawn(m: Measured) -> dict[str, bytes]:
-    """Title -> PNG, of what could be measured."""
-    pictures = {"Beams: elevation of each, and how far its points scatter": _beams,
-                "The ground: height of the points around above the plane that was fitted": _ground,
-                "The robot's body and blind sectors": _coverage,
-                "Intensities": _intensities,
-                "One scan with the parameters of robot.param.yaml: ground and clusters": _scan}
-    return {title: png for title, draw in pictures.items() if (png := _png(draw, m)) is not None}
+def draw_figures(m: SensorMeasurement) -> dict[str, bytes]:
+    """Return the pictures of everything that could be measured as PNG, by title."""
+    pictures = {"Beams: elevation of each, and the scatter of its points": _draw_beams,
+                "Ground: height of the points around above the fitted plane": _draw_ground,
+                "The robot's body and blind sectors": _draw_coverage,
+                "Intensities": _draw_intensities,
+                "One scan with the parameters of robot.param.yaml: ground and clusters": _draw_scan}
+    return {title: png for title, draw in pictures.items()
+            if (png := _to_png(draw, m)) is not None}
 
 
-def _png(draw: Any, m: Measured) -> bytes | None:
+def _to_png(draw: Any, m: SensorMeasurement) -> bytes | None:
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context({"font.size": 9, "legend.frameon": False}):
-        figure = Figure(figsize=SIZE, dpi=110, layout="constrained")
+        figure = Figure(figsize=FIGURE_SIZE, dpi=110, layout="constrained")
         FigureCanvasAgg(figure)
         if not draw(figure, m):
             return None
@@ -50,46 +52,51 @@ def _png(draw: Any, m: Measured) -> bytes | None:
     return stream.getvalue()
 
 
-def _beams(figure: Any, m: Measured) -> bool:
+def _draw_beams(figure: Any, m: SensorMeasurement) -> bool:
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    every = np.concatenate([scan.elevation for scan in m.scans])
-    low, high = np.percentile(every, [0.1, 99.9])
-    left.hist(every, np.linspace(low - 1, high + 1, 600), color=GREY, orientation="horizontal")
-    left.set(xlabel="points", ylabel="elevation (deg)", title="points, and beams")
-    if m.beams is None:
+    elevations = np.concatenate([scan.elevation for scan in m.source.scans])
+    low, high = np.percentile(elevations, [0.1, 99.9])
+    left.hist(elevations, np.linspace(low - 1, high + 1, 600), color=GREY, orientation="horizontal")
+    left.set(xlabel="points", ylabel="elevation (deg)", title="points and beams")
+    beams, model = m.pattern.beams, m.pattern.model
+    if beams is None:
         right.text(0.5, 0.5, "no beams", ha="center")
         return True
     edge = left.get_xlim()[1]
-    left.hlines(m.beams.elevations, 0, edge, color=BLUE, linewidth=0.4)
-    known = np.degrees(sensor_named(m.model).elevations) if m.model else None
-    off = np.zeros(len(m.beams.elevations)) if known is None else m.beams.elevations - known[
-        np.abs(m.beams.elevations[:, None] - known).argmin(axis=1)]
-    right.errorbar(off, np.arange(len(off)), xerr=m.beams.error, fmt=".", color=BLUE, markersize=4)
+    left.hlines(beams.elevations, 0, edge, color=BLUE, linewidth=0.4)
+    difference = np.zeros(len(beams.elevations))
+    if model:
+        expected = np.degrees(sensor_named(model).elevations)
+        difference = beams.elevations - expected[
+            np.abs(beams.elevations[:, None] - expected).argmin(axis=1)]
+    right.errorbar(difference, np.arange(len(difference)), xerr=beams.error, fmt=".", color=BLUE,
+                   markersize=4)
     right.axvline(0.0, color=ORANGE, linewidth=0.8)
-    limit = max(0.05, 1.2 * float((np.abs(off) + m.beams.error).max()))
+    limit = max(0.05, 1.2 * float((np.abs(difference) + beams.error).max()))
     right.set(xlabel="deg", ylabel="beam", xlim=(-limit, limit),
-              title=f"elevation less that of {m.model}" if m.model else "error of the elevation")
+              title=f"difference to {model}" if model else "error of the elevation")
     right.invert_yaxis()
     return True
 
 
-def _ground(figure: Any, m: Measured) -> bool:
-    if m.mount is None:
+def _draw_ground(figure: Any, m: SensorMeasurement) -> bool:
+    mount = m.mounting.mount
+    if mount is None:
         return False
-    i = next(k for k, plane in enumerate(m.mount.planes) if plane is not None)
-    plane, scan = m.mount.planes[i], m.scans[i]
+    i = next(k for k, plane in enumerate(mount.planes) if plane is not None)
+    plane, scan = mount.planes[i], m.source.scans[i]
     assert plane is not None
     xyz = transform_points(scan.xyz, make_tilted_pose(plane.roll, plane.pitch, plane.height))
-    near = np.hypot(*xyz[:, :2].T) < 25.0
-    above, side = figure.subplots(1, 2)
-    some = _some(near)
-    on = above.scatter(*xyz[some, :2].T, c=xyz[some, 2], s=0.6, cmap="coolwarm",
-                       vmin=-0.3, vmax=0.3)
-    figure.colorbar(on, ax=above, label="above the plane (m), cut at 0.3")
-    above.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title="from above")
-    side.scatter(xyz[some, 0], xyz[some, 2], s=0.6, color=GREY, label="points")
-    used = _some(near & plane.on)
-    side.scatter(xyz[used, 0], xyz[used, 2], s=0.8, color=GREEN, label="fitted")
+    near = np.hypot(*xyz[:, :2].T) < GROUND_RADIUS_M
+    top, side = figure.subplots(1, 2)
+    drawn = _sample(near)
+    points = top.scatter(*xyz[drawn, :2].T, c=xyz[drawn, 2], s=0.6, cmap="coolwarm",
+                         vmin=-0.3, vmax=0.3)
+    figure.colorbar(points, ax=top, label="above the plane (m), cut at 0.3")
+    top.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title="from above")
+    side.scatter(xyz[drawn, 0], xyz[drawn, 2], s=0.6, color=GREY, label="points")
+    fitted = _sample(near & plane.on)
+    side.scatter(xyz[fitted, 0], xyz[fitted, 2], s=0.8, color=GREEN, label="fitted")
     side.axhline(0.0, color=ORANGE, linewidth=0.8)
     side.plot([0], [plane.height], "^", color=ORANGE, markersize=5, label="sensor")
     side.set(ylim=(-0.8, plane.height + 1.0), xlabel="x (m)", ylabel="above the ground (m)",
@@ -98,15 +105,15 @@ def _ground(figure: Any, m: Measured) -> bool:
     return True
 
 
-def _some(mask: np.ndarray) -> np.ndarray:
-    """Indices where mask, MAX_DRAWN at most."""
+def _sample(mask: np.ndarray) -> np.ndarray:
+    """Return indices where mask is true, at most MAX_DRAWN_POINTS."""
     found = np.flatnonzero(mask)
-    return found[::max(1, -(-len(found) // MAX_DRAWN))]
+    return found[::max(1, -(-len(found) // MAX_DRAWN_POINTS))]
 
 
-def _coverage(figure: Any, m: Measured) -> bool:
+def _draw_coverage(figure: Any, m: SensorMeasurement) -> bool:
     from matplotlib.colors import ListedColormap
-    c = m.coverage
+    c = m.view.coverage
     picture = np.where(c.body, 2, np.where(c.seen == 0, 1, 0))
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     left.imshow(picture, aspect="auto", interpolation="nearest", vmin=0, vmax=2,
@@ -114,8 +121,8 @@ def _coverage(figure: Any, m: Measured) -> bool:
                 cmap=ListedColormap(["#dddddd", "#333333", ORANGE]))
     left.set(xlabel="azimuth (deg), 0 ahead, 90 left", ylabel="beam, 0 the highest",
              title="grey: seen, black: never a return, orange: body")
-    scan = m.scans[0]
-    near = _some(np.hypot(*scan.xyz[:, :2].T) < 5.0)
+    scan = m.source.scans[0]
+    near = _sample(np.hypot(*scan.xyz[:, :2].T) < 5.0)
     right.scatter(*scan.xyz[near, :2].T, s=0.8, color=GREY)
     if len(c.box):
         x0, y0, _, x1, y1, _ = c.box
@@ -126,7 +133,7 @@ def _coverage(figure: Any, m: Measured) -> bool:
     return True
 
 
-def _intensities(figure: Any, m: Measured) -> bool:
+def _draw_intensities(figure: Any, m: SensorMeasurement) -> bool:
     i = m.intensity
     if i is None:
         return False
@@ -134,22 +141,22 @@ def _intensities(figure: Any, m: Measured) -> bool:
     centres = (np.arange(len(i.histogram)) + 0.5) * i.full / len(i.histogram)
     axis.bar(centres, i.histogram, i.full / len(i.histogram) * 0.9, color=BLUE)
     axis.axvline(RETROREFLECTOR * i.full, color=ORANGE, linewidth=0.8)
-    axis.set(yscale="log", xlabel="intensity as in the cloud", ylabel="points",
-             title=f"{100 * i.zeros:.1f} % are 0, {100 * i.bright:.2f} % beyond the line as bright "
-                   "as retroreflectors")
+    axis.set(yscale="log", xlabel="intensity in the cloud's scale", ylabel="points",
+             title=f"{100 * i.zeros:.1f} % are 0, {100 * i.bright:.2f} % beyond the line are as "
+                   "bright as retroreflectors")
     return True
 
 
-def _scan(figure: Any, m: Measured) -> bool:
-    values = {name: value for name, (value, _) in chosen_params(m).items()}
+def _draw_scan(figure: Any, m: SensorMeasurement) -> bool:
+    values = {name: value for name, (value, _) in choose_params(m).items()}
     params = with_values(PipelineParams(), values)
-    scan = m.scans[len(m.scans) // 2]
+    scan = m.source.scans[len(m.source.scans) // 2]
     intensity = None if scan.intensity is None else (
         scan.intensity / params.input.intensity_max if params.input.intensity_max else
         scan.intensity).astype(np.float32)
     frame = LidarFrame(scan.xyz.astype(np.float32), intensity)
     _, frame = crop_frame(frame, params.crop)
-    if m.mount is None:  # a plane at an unknown height would take furniture for ground
+    if m.mounting.mount is None:  # at an unknown height, furniture might count as ground
         ground = np.zeros(len(frame), bool)
     else:
         ground = segment_ground(frame, params.ground)
@@ -161,10 +168,10 @@ def _scan(figure: Any, m: Measured) -> bool:
     axis = figure.subplots()
     for mask, color, size, label in ((ground, "#9aa8b8", 0.5, "ground"),
                                      (~ground & (labels == 0), "#cccccc", 0.5, "neither")):
-        axis.scatter(*frame.xyz[_some(near & mask), :2].T, s=size, color=color, label=label)
-    shown = _some(near & (labels > 0))
-    axis.scatter(*frame.xyz[shown, :2].T, s=1.2, c=labels[shown] * 7 % 20, cmap="tab20",
-                 label="clusters, each in a colour")
+        axis.scatter(*frame.xyz[_sample(near & mask), :2].T, s=size, color=color, label=label)
+    clustered = _sample(near & (labels > 0))
+    axis.scatter(*frame.xyz[clustered, :2].T, s=1.2, c=labels[clustered] * 7 % 20, cmap="tab20",
+                 label="clusters, by colour")
     axis.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"{int(labels.max(initial=0))} "
              f"clusters; {100 * ground.mean():.0f} % of the points are ground")
     axis.legend(markerscale=5, loc="upper left", bbox_to_anchor=(1.0, 1.0))

@@ -1,0 +1,1 @@
+"""Measurements from clouds: pure functions on arrays."""

@@ -1,0 +1,278 @@
+"""Measurement of a sensor and its mounting from its clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from lidar_perception.robot.crop import select_points
+from lidar_perception.robot.params import CropParams
+from lidar_perception.robot.poses import invert_pose, transform_points
+from lidar_perception.sensor_setup.measurement.beams import (
+    Beams,
+    find_beams,
+    measure_azimuth_step,
+    measure_range_noise,
+)
+from lidar_perception.sensor_setup.measurement.coverage import (
+    Coverage,
+    find_nearest,
+    is_standing_still,
+    measure_coverage,
+)
+from lidar_perception.sensor_setup.measurement.motion import (
+    Heading,
+    compute_shifts,
+    compute_spectrum,
+    draw_images,
+    estimate_heading,
+    find_shift,
+    find_shifts,
+)
+from lidar_perception.sensor_setup.measurement.mount import Mount, is_on_ground, measure_mount
+from lidar_perception.sensor_setup.measurement.recorded_poses import NO_POSES, RecordedPoses
+from lidar_perception.sensor_setup.measurement.scans import (
+    IntensityScale,
+    Scan,
+    measure_intensity,
+    require_3d,
+)
+from lidar_perception.sensor_setup.measurement.timing import Timing, measure_timing
+from lidar_perception.simulation.sensor import NAMES, sensor_named
+from lidar_perception.types import InputError
+
+MAX_MODEL_ERROR = 0.15  # degrees between the beams of sensors of one model, the median
+# The same for a different number of beams, as a share of the model's beam distance. Beams of any
+# sensor are a quarter of it from the nearest beam.
+MAX_PARTIAL_ERROR = 1 / 6
+MIN_SCANS = 5        # fewer cannot separate the robot from its surroundings
+MIN_OUTDOOR_RANGE_M = 30.0  # if nothing is farther, the room limits the range and not the sensor
+MAX_OWN_SPREAD = 0.01  # degrees between points of a beam, beyond which they have been moved
+MIN_MOTION_M = 0.1   # a robot that moved less stands still
+MIN_POSE_MOTION_M = 2.0  # by its poses, which drift while it stands
+PEOPLE_ELEVATIONS = (-15.0, 5.0)  # degrees: where people are seen and the beam distance counts
+
+
+class CloudSource(NamedTuple):
+    """Measured clouds. name: of the recording; total: number of its clouds."""
+
+    name: str
+    scans: tuple[Scan, ...]
+    total: int
+
+    @property
+    def frame_ids(self) -> list[str]:
+        """Frames of the clouds, sorted, without empty ones."""
+        return sorted({scan.frame_id for scan in self.scans} - {""})
+
+    @property
+    def has_few_scans(self) -> bool:
+        """True with fewer than MIN_SCANS scans."""
+        return len(self.scans) < MIN_SCANS
+
+
+class ScanPattern(NamedTuple):
+    """Beams of the sensor.
+
+    Attributes:
+        beams: The beams; None if there are none.
+        azimuth_step: Degrees, NaN without beams.
+        second_returns: Share of the points that are second returns.
+        range_noise: Metres, NaN if unknown.
+        noise_pieces: Number of pieces that the noise was measured on.
+        model: Sensor of config/sensors with such beams, "" for none.
+        model_error: Median difference to its beams in degrees.
+    """
+
+    beams: Beams | None
+    azimuth_step: float
+    second_returns: float
+    range_noise: float
+    noise_pieces: int
+    model: str
+    model_error: float
+
+    @property
+    def is_moved(self) -> bool:
+        """True if points are not where the sensor measured them, as after motion correction."""
+        return self.beams is not None and float(np.median(self.beams.spread)) > MAX_OWN_SPREAD
+
+    @property
+    def prefers_model(self) -> bool:
+        """True if the model's beams are more reliable than the measured ones, which agree.
+
+        That is so if points were moved, or beams are missing.
+        """
+        if not self.model or self.beams is None:
+            return False
+        count, model_count = len(self.beams.elevations), sensor_named(self.model).rings
+        return count < model_count or (self.is_moved and count == model_count)
+
+
+class View(NamedTuple):
+    """Coverage of the sensor, and the range of returns that are not of the robot, in metres."""
+
+    coverage: Coverage
+    min_range: float
+    max_range: float
+
+
+class Mounting(NamedTuple):
+    """Mounting of the sensor on the robot.
+
+    Attributes:
+        mount: Pose over the ground; None if unknown.
+        on_ground: The origin of the clouds is on the ground, and the mount is unknown.
+        heading: Direction in which the robot drives; None without ground.
+        recorded: Poses in the recording.
+        height_hint: Height that the user gave in metres; None without one.
+    """
+
+    mount: Mount | None
+    on_ground: bool
+    heading: Heading | None
+    recorded: RecordedPoses
+    height_hint: float | None
+
+
+@dataclass(frozen=True)
+class SensorMeasurement:
+    """Everything that was measured."""
+
+    source: CloudSource
+    pattern: ScanPattern
+    intensity: IntensityScale | None
+    view: View
+    mounting: Mounting
+    timing: Timing
+
+    @property
+    def elevation_step(self) -> float:
+        """Median degrees between beams where people are seen; NaN without beams."""
+        if self.pattern.beams is None:
+            return np.nan
+        elevations = self.pattern.beams.elevations
+        if self.mounting.mount is not None and self.mounting.mount.upside_down:
+            elevations = -elevations[::-1]
+        low, high = PEOPLE_ELEVATIONS
+        middle = elevations[(elevations >= low) & (elevations <= high)]
+        steps = -np.diff(middle if len(middle) > 2 else elevations)
+        return float(np.median(steps)) if len(steps) else np.nan
+
+
+def measure_sensor(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: int,
+                   stamps_ns: np.ndarray | None, recorded: RecordedPoses = NO_POSES,
+                   height_hint: float | None = None) -> SensorMeasurement:
+    """Measure a sensor and its mounting.
+
+    Args:
+        scans: Scans of the sensor.
+        numbers: Their numbers in the recording.
+        source: Name of the recording.
+        total: Number of clouds in the recording.
+        stamps_ns: Stamps of all clouds in ns; None without any.
+        recorded: Poses in the recording.
+        height_hint: Height of the sensor in metres, if known.
+
+    Raises:
+        InputError: The clouds are of several drivers, or of a 2D scanner.
+    """
+    if len({scan.columns for scan in scans}) > 1:
+        raise InputError(f"{source} has clouds of several layouts ({', '.join(scans[0].columns)} "
+                         "and others), as of several sensors; give those of one")
+    require_3d(np.concatenate([scan.elevation for scan in scans]), source)
+    pattern = _measure_pattern(scans)
+    mount = measure_mount(scans)
+    nearest = find_nearest(scans, pattern.beams)
+    # On a field, the uniform surroundings of a moving robot look constant.
+    still = False if recorded.distance >= MIN_POSE_MOTION_M else is_standing_still(nearest.ranges)
+    heading = _find_heading(scans, numbers, mount, still, recorded)
+    # People and doors change the surroundings of a standing robot.
+    still = True if len(scans) > 1 and _measure_distance(
+        scans, mount, heading, recorded) < MIN_MOTION_M else still
+    view = _measure_view(scans, measure_coverage(scans, nearest, mount, still))
+    # Level beams of the sensor itself are in a plane through its origin, too.
+    may_be_on_ground = mount is None and (pattern.beams is None or pattern.is_moved)
+    return SensorMeasurement(
+        CloudSource(source, tuple(scans), total), pattern, measure_intensity(scans), view,
+        Mounting(mount, may_be_on_ground and is_on_ground(scans), heading, recorded, height_hint),
+        measure_timing(scans, stamps_ns))
+
+
+def _measure_pattern(scans: Sequence[Scan]) -> ScanPattern:
+    beams = find_beams(scans)
+    step, second_returns, noise, pieces = np.nan, 0.0, np.nan, 0
+    if beams is not None:
+        step, second_returns = measure_azimuth_step(scans, beams)
+        noise, pieces = measure_range_noise(scans, beams, step)
+    return ScanPattern(beams, step, second_returns, noise, pieces, *match_model(beams))
+
+
+def _measure_view(scans: Sequence[Scan], coverage: Coverage) -> View:
+    ranges = np.concatenate([s.range for s in scans])
+    outside = ranges[select_points(np.concatenate([s.xyz for s in scans]), CropParams(
+        body=tuple(coverage.box.tolist()) if coverage.can_crop else ()))]
+    low, high = np.percentile(outside if len(outside) else ranges, [0.02, 99.995])
+    return View(coverage, float(low), float(high))
+
+
+def _find_heading(scans: Sequence[Scan], numbers: Sequence[int], mount: Mount | None,
+                  still: bool | None, recorded: RecordedPoses) -> Heading | None:
+    if mount is None:
+        return None
+    shifts = find_shifts(draw_images(_level_scans(scans, mount), moves=still is False), numbers)
+    if recorded.base or not recorded.poses:
+        return estimate_heading(shifts, compute_shifts(recorded.poses, shifts))
+    # Odometry of the sensor itself shows where it went, but not the x axis of a base.
+    level = invert_pose(mount.pose)
+    poses = {number: sensor @ level for number, sensor in recorded.poses.items()}
+    return estimate_heading(compute_shifts(poses, shifts), {})
+
+
+def _level_scans(scans: Sequence[Scan], mount: Mount) -> list[np.ndarray]:
+    return [transform_points(scan.xyz, mount.pose) for scan in scans]
+
+
+def _measure_distance(scans: Sequence[Scan], mount: Mount | None, heading: Heading | None,
+                      recorded: RecordedPoses) -> float:
+    """Return the distance that the robot covered in metres, NaN if unclear.
+
+    It comes from the poses, else from clouds near each other and from the first and the last one,
+    since the robot may be slow.
+    """
+    distance = recorded.distance
+    # Poses of a part of the clouds may be of a stop.
+    if len(recorded.poses) == len(scans) or distance >= MIN_MOTION_M:
+        return distance
+    if mount is None or heading is None:
+        return np.nan
+    ends = _level_scans([scans[0], scans[-1]], mount)
+    shift = find_shift(*map(compute_spectrum, draw_images(ends, moves=False)))
+    return np.nan if shift is None else float(np.maximum(heading.distance, np.hypot(*shift)))
+
+
+def match_model(beams: Beams | None) -> tuple[str, float]:
+    """Find the sensor of config/sensors that has these beams, or most of them.
+
+    Returns:
+        Its name, "" for none, and the median difference of the beams in degrees.
+    """
+    best, error = "", MAX_MODEL_ERROR
+    if beams is None:
+        return best, np.nan
+    for name in NAMES:
+        elevations = np.degrees(sensor_named(name).elevations)
+        if sensor_named(name).wander or not (
+                0.75 <= len(beams.elevations) / len(elevations) <= 1.05):
+            continue
+        is_complete = len(beams.elevations) == len(elevations)
+        difference = np.abs(beams.elevations - elevations if is_complete else
+                            np.abs(beams.elevations[:, None] - elevations).min(axis=1))
+        limit = error if is_complete else min(
+            error, MAX_PARTIAL_ERROR * float(np.median(-np.diff(elevations))))
+        if np.median(difference) < limit and np.percentile(difference, 90) < 5 * MAX_MODEL_ERROR:
+            best, error = name, float(np.median(difference))
+    return best, error if best else np.nan

@@ -1,0 +1,101 @@
+"""Poses that a recording contains: where the sensor is mounted, and how the robot moved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lidar_perception.data.bag_poses import BagPoses
+from lidar_perception.robot.placement import find_roll_pitch
+from lidar_perception.robot.poses import invert_pose
+from lidar_perception.robot.transform_tree import MissingTransform
+
+FOOTPRINT = "base_footprint"  # on the ground below base_link (REP-120)
+
+
+class RecordedPoses(NamedTuple):
+    """Poses from the TF and odometry of a recording.
+
+    Attributes:
+        base: The robot's frame, "" for none.
+        mount: (4, 4) pose of the sensor in the base; None if TF does not contain it.
+        footprint: (4, 4) pose of the sensor in base_footprint; None if TF does not contain it.
+        poses: Pose of the base in a fixed frame by number of the cloud. Without a base, the pose of
+            the sensor.
+        left_out: Number of transforms and odometry messages that are no valid poses.
+        problem: Why most clouds have no pose although the recording has some, else "".
+    """
+
+    base: str = ""
+    mount: np.ndarray | None = None
+    footprint: np.ndarray | None = None
+    poses: Mapping[int, np.ndarray] = {}
+    left_out: int = 0
+    problem: str = ""
+
+    @property
+    def roll_pitch(self) -> tuple[float, float]:
+        """Roll and pitch of the sensor in the base in degrees; NaN if unknown."""
+        if self.mount is None:
+            return np.nan, np.nan
+        roll, pitch = np.degrees(find_roll_pitch(self.mount))
+        return float(roll), float(pitch)
+
+    @property
+    def height(self) -> float:
+        """Height of the sensor above base_footprint in metres; NaN if unknown."""
+        return np.nan if self.footprint is None else float(self.footprint[2, 3])
+
+    @property
+    def heading(self) -> float:
+        """Angle from x of the levelled sensor to x of the base in degrees; NaN if unknown."""
+        return np.nan if self.mount is None else float(
+            -np.degrees(np.arctan2(self.mount[1, 0], self.mount[0, 0])))
+
+    @property
+    def distance(self) -> float:
+        """Distance that the robot covered along x or y in metres; NaN without poses."""
+        return float(np.ptp([pose[:2, 3] for pose in self.poses.values()], axis=0).max()
+                     ) if self.poses else np.nan
+
+
+NO_POSES = RecordedPoses()
+
+
+def read_recorded_poses(poses: BagPoses | None, numbers: Sequence[int],
+                        stamps_ns: np.ndarray | None) -> RecordedPoses:
+    """Return what the odometry and TF of a bag contain.
+
+    Args:
+        poses: Poses of the bag; None for a recording without any.
+        numbers: Numbers of the clouds to find poses for.
+        stamps_ns: Stamps of all clouds, ns.
+    """
+    if poses is None or stamps_ns is None or not (poses.base or poses.odometry):
+        return NO_POSES
+    base = poses.base
+    mount = poses.find_mount(base) if base else None
+    by_cloud = {}
+    # Odometry without child_frame_id may be of another frame than the base.
+    is_nameless = poses.odometry and not poses.carrier
+    for number in () if is_nameless else numbers:
+        pose = _find_base_pose(poses, int(stamps_ns[number]), mount if base else np.eye(4))
+        if pose is not None:
+            by_cloud[number] = pose
+    problem = "" if 2 * len(by_cloud) >= len(numbers) or not poses.available else (
+        "the odometry has no child_frame_id" if is_nameless else
+        f"{len(numbers) - len(by_cloud)} of {len(numbers)} clouds have no pose at their time")
+    return RecordedPoses(base, mount, poses.find_mount(FOOTPRINT), by_cloud, poses.invalid_count,
+                         problem)
+
+
+def _find_base_pose(poses: BagPoses, stamp_ns: int, mount: np.ndarray | None) -> np.ndarray | None:
+    if poses.carrier == poses.base:
+        try:
+            return poses.carrier_pose(stamp_ns)
+        except MissingTransform:
+            return None
+    pose = poses(stamp_ns)
+    return None if pose is None or mount is None else pose @ invert_pose(mount)

@@ -1,0 +1,1 @@
+"""Text, pictures and files about a measured sensor."""
