@@ -121,8 +121,8 @@ class IntensityScale(NamedTuple):
     """Intensities of all scans together.
 
     Attributes:
-        full: Value of a full reflection, see intensity.infer_full_scale; the greatest value if that is
-            far beyond it.
+        full: Value of a full reflection, see intensity.infer_full_scale; the greatest value if
+            that is far beyond it.
         sure: The values show the scale.
         whole: All values are whole numbers.
         greatest: Greatest value.
