@@ -19,7 +19,7 @@ from lidar_perception.detectors.fused.params import FusedDetectorParams
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
 from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.nodes.graph import NETWORKS
-from lidar_perception.nodes.known import node_parameters
+from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.param_fields import flatten
 
 CONFIG = Path(__file__).parents[1] / "config"
@@ -238,7 +238,7 @@ def outputs(name: str) -> list[tuple[str, str, str]]:
 
 
 def _managed(name: str) -> bool:
-    return "autostart" in node_parameters(name)
+    return "autostart" in find_node_parameters(name)
 
 
 def page(name: str) -> str:
@@ -246,7 +246,7 @@ def page(name: str) -> str:
     lines = [f"# {name}", "", node["what"], "",
              f"    ros2 run lidar_perception {name}      # or: lidar-perception run {name}", ""]
     own = {topic for topic, *_ in node["inputs"]}
-    robot = [row for row in ROBOT_IN if "base_frame" in node_parameters(name)
+    robot = [row for row in ROBOT_IN if "base_frame" in find_node_parameters(name)
              and row[0] not in own]
     for title, rows in (("Subscribes", node["inputs"] + robot), ("Publishes", outputs(name)),
                         ("Services", MANAGED_SERVICES if _managed(name)
@@ -254,11 +254,11 @@ def page(name: str) -> str:
         if rows:
             lines += [f"## {title}", "", "| name | type | |", "|---|---|---|",
                       *(f"| `{a}` | {b} | {c} |" for a, b, c in rows), ""]
-    if "tracking.enabled" in node_parameters(name):
+    if "tracking.enabled" in find_node_parameters(name):
         lines += ["With `tracking.enabled` the node has the topics of the [tracker](tracker.md), "
                   "too; a detector with a network then tracks weak detections as well, from "
                   "`tracking.min_score` on.", ""]
-    known = node_parameters(name)
+    known = find_node_parameters(name)
     first = [key for key in FIRST if key in known][:10] or [*known][:10]
     rest = [key for key in known if key not in first]
     lines += ["## Parameters", "", *_parameter_table(known, first)]

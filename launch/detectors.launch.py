@@ -1,17 +1,17 @@
-"""Ground and clusters of a live or replayed cloud, once, and any of the detectors behind them.
+"""Launch ground segmentation, clustering and any of the detectors for one sensor.
 
     ros2 launch lidar_perception detectors.launch.py detectors:=pointpillars,candidates
     ros2 launch lidar_perception detectors.launch.py detectors:=pointpillars tracking:=true
 
-Two sensors: one launch for each, with namespace:=left and namespace:=right.
+For two sensors start it twice, with namespace:=left and namespace:=right.
 """
 
 from pathlib import Path
 
-from lidar_perception.nodes.launching import graph_launch
+from lidar_perception.nodes.launching import make_launch_description
 
 CONFIGS = Path(__file__).resolve().parents[1] / "config"
 
 
 def generate_launch_description():
-    return graph_launch(CONFIGS, "fused")
+    return make_launch_description(CONFIGS, "fused")

@@ -1,14 +1,14 @@
-"""Cars, pedestrians and cyclists by all sources together; a case of detectors.launch.py.
+"""Launch the fused detector of cars, pedestrians and cyclists; see detectors.launch.py.
 
     ros2 launch lidar_perception fused.launch.py points:=/velodyne_points
 """
 
 from pathlib import Path
 
-from lidar_perception.nodes.launching import graph_launch
+from lidar_perception.nodes.launching import make_launch_description
 
 CONFIGS = Path(__file__).resolve().parents[1] / "config"
 
 
 def generate_launch_description():
-    return graph_launch(CONFIGS, "fused")
+    return make_launch_description(CONFIGS, "fused")

@@ -1,15 +1,14 @@
-"""Pedestrian candidates on a live or replayed cloud;
-a case of detectors.launch.py.
+"""Launch the pedestrian candidate pipeline; see detectors.launch.py.
 
     ros2 launch lidar_perception perception.launch.py points:=/velodyne_points
 """
 
 from pathlib import Path
 
-from lidar_perception.nodes.launching import graph_launch
+from lidar_perception.nodes.launching import make_launch_description
 
 CONFIGS = Path(__file__).resolve().parents[1] / "config"
 
 
 def generate_launch_description():
-    return graph_launch(CONFIGS, "candidates")
+    return make_launch_description(CONFIGS, "candidates")

@@ -1,15 +1,14 @@
-"""Cars, pedestrians and cyclists in a live or replayed cloud, by EG-PointPillars;
-a case of detectors.launch.py.
+"""Launch the EG-PointPillars detector of cars, pedestrians and cyclists; see detectors.launch.py.
 
     ros2 launch lidar_perception pointpillars.launch.py points:=/velodyne_points
 """
 
 from pathlib import Path
 
-from lidar_perception.nodes.launching import graph_launch
+from lidar_perception.nodes.launching import make_launch_description
 
 CONFIGS = Path(__file__).resolve().parents[1] / "config"
 
 
 def generate_launch_description():
-    return graph_launch(CONFIGS, "pointpillars")
+    return make_launch_description(CONFIGS, "pointpillars")

@@ -1,4 +1,4 @@
-"""Replay a bag through the pipeline and score it; everything ends with the bag.
+"""Launch a replay of a bag through the candidate pipeline with an evaluator; it ends with the bag.
 
     ros2 launch lidar_perception replay.launch.py bag:=drive scores:=scores.json
 """
@@ -23,18 +23,18 @@ from launch_ros.actions import Node
 from launch import LaunchDescription
 from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.graph import (
-    chosen_clouds,
-    evaluation,
-    relative,
-    result_topics,
-    wait_for,
+    choose_cloud_topic,
+    configure_evaluator,
+    list_awaited_topics,
+    list_result_topics,
+    relative_name,
 )
 from lidar_perception.nodes.launching import (
     ARGUMENTS,
-    given_arguments,
-    parameter_files,
-    refuse_unknown,
-    with_arguments,
+    add_arguments,
+    find_given_arguments,
+    list_parameter_files,
+    reject_unknown_arguments,
 )
 from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.wire.clouds import CLOUD_TYPES
@@ -45,81 +45,82 @@ VALUES = ("bag", "rate", "loop", "scores", "points", "config", "single", "real_t
 HERE = Path(__file__).resolve().parent
 CONFIG = HERE.parent / "config" / "replay.param.yaml"
 GLOBAL = {TF_STATIC, "/tf", "/clock", "/diagnostics"}
-SECONDS_FOR_THE_LAST_FRAME = 1.0
-# What the player and the evaluator rely on. launch hands on to an included file whatever was given.
+LAST_FRAME_DELAY_S = 1.0
+# Fixed, as the player and the evaluator rely on it; launch passes all given arguments on to an
+# included file.
 GRAPH = {"detectors": "candidates", "namespace": "", "name_prefix": ""}
 
 
 def replay(context, given):
-    refuse_unknown(given, context, {*VALUES, "rviz", *ARGUMENTS} - GRAPH.keys())
+    reject_unknown_arguments(given, context, {*VALUES, "rviz", *ARGUMENTS} - GRAPH.keys())
     value = {k: context.perform_substitution(LaunchConfiguration(k))
              for k in VALUES}
     single = value["single"] == "true"
-    files = [str(CONFIG), *parameter_files(value["config"])]
-    use_large_shared_memory()  # of the player, so that the nodes need not take it for a driver
+    files = [str(CONFIG), *list_parameter_files(value["config"])]
+    use_large_shared_memory()  # set here, so that the nodes do not take the player for a driver
     with Bag(value["bag"]) as bag:
-        clouds = chosen_clouds(value["bag"], bag.topics, value["points"])
+        clouds = choose_cloud_topic(value["bag"], bag.topics, value["points"])
         played = [t for t, kind in bag.topics.items() if t == clouds or kind not in CLOUD_TYPES]
     sim_time = {"use_sim_time": value["use_sim_time"] == "true"}
     log_level = ["--log-level", value["log_level"]]
-    remap, scoring = evaluation(value["scores"], single)
-    final = relative(result_topics(single)["final"])
+    remap, scoring = configure_evaluator(value["scores"], single)
+    final = relative_name(list_result_topics(single)["final"])
     real_time = value["real_time"] == "true"
-    # launch knows no type of an empty list
+    # launch cannot determine the type of an empty list.
     follow = {} if real_time else {"follow": [final]}
-    waits = [*wait_for(single), f"{final}:={1 if real_time else 2}"]  # evaluator, player
+    waits = [*list_awaited_topics(single), f"{final}:={1 if real_time else 2}"]  # evaluator, player
     player = Node(
         package="lidar_perception", executable="bag_player", name="bag_player", output="screen",
-        parameters=with_arguments(files, "bag_player", {
+        parameters=add_arguments(files, "bag_player", {
             "bag": value["bag"], "rate": float(value["rate"]), "loop": value["loop"] == "true",
             "topics": played, **follow, "wait_for": waits}),
         # Relative, so that they go into a namespace if this file is included in one.
-        remappings=[(t, relative(POINTS if t == clouds else t)) for t in played
+        remappings=[(t, relative_name(POINTS if t == clouds else t)) for t in played
                     if t not in GLOBAL],
         ros_arguments=log_level)
     evaluator = Node(
         package="lidar_perception", executable="evaluator", name="evaluator", output="screen",
-        parameters=with_arguments(files, "evaluator", {**scoring, **sim_time}),
+        parameters=add_arguments(files, "evaluator", {**scoring, **sim_time}),
         remappings=list(remap.items()), ros_arguments=log_level)
-    end = TimerAction(period=SECONDS_FOR_THE_LAST_FRAME,
+    end = TimerAction(period=LAST_FRAME_DELAY_S,
                       actions=[EmitEvent(event=Shutdown(reason="the bag is played"))])
-    found = context.launch_configurations
-    return [*(LogInfo(msg=f"{name}:={found[name]} is no argument of replay.launch.py")
-              for name, fixed in GRAPH.items() if found.get(name, fixed) != fixed),
+    configurations = context.launch_configurations
+    return [*(LogInfo(msg=f"{name}:={configurations[name]} is not an argument of replay.launch.py")
+              for name, fixed in GRAPH.items() if configurations.get(name, fixed) != fixed),
             player, evaluator,
             RegisterEventHandler(OnProcessExit(target_action=player, on_exit=[end]))]
 
 
 def generate_launch_description():
-    given = given_arguments()
+    given = find_given_arguments()
     pipeline = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(HERE / "perception.launch.py")),
         launch_arguments={
-            "points": relative(POINTS), **GRAPH,
+            "points": relative_name(POINTS), **GRAPH,
             "config": [f"{CONFIG},", LaunchConfiguration("config")],
             **{k: LaunchConfiguration(k) for k in ("single", "rviz", "use_sim_time", "log_level")},
         }.items())
     return LaunchDescription([
         DeclareLaunchArgument("bag", description="Folder of the bag."),
-        DeclareLaunchArgument("points", default_value="", description="The bag's topic of clouds; "
-                              "empty: the only one it has."),
+        DeclareLaunchArgument("points", default_value="", description="Topic of the clouds; may be "
+                              "empty if the bag has only one."),
         DeclareLaunchArgument("rate", default_value="1.0", description="Speed of the replay."),
         DeclareLaunchArgument("loop", default_value="false", choices=["true", "false"],
-                              description="Start again at the end."),
+                              description="Restart the bag at its end."),
         DeclareLaunchArgument("scores", default_value="", description="JSON file for the scores."),
-        DeclareLaunchArgument("config", default_value="", description="Parameter files, with "
-                              "commas, on top of config/replay.param.yaml."),
+        DeclareLaunchArgument("config", default_value="", description="Comma-separated parameter "
+                              "files, loaded after config/replay.param.yaml."),
         DeclareLaunchArgument("single", default_value="false", choices=["true", "false"],
-                              description="All stages in one process."),
+                              description="Run all stages in one process."),
         DeclareLaunchArgument("rviz", default_value="false", choices=["true", "false"],
                               description="Start RViz with config/lidar_perception.rviz."),
         DeclareLaunchArgument("real_time", default_value="false", choices=["true", "false"],
-                              description="Play as a sensor sends; false: a cloud is sent when "
-                              "those before have their result."),
+                              description="Play at the rate of the sensor; false: send a cloud "
+                              "once the clouds before it have results."),
         DeclareLaunchArgument("use_sim_time", default_value="true", choices=["true", "false"],
                               description="Take the time from /clock."),
         DeclareLaunchArgument("log_level", default_value="info", description="debug, info, ..."),
-        # First, because the pipeline sets `points` and `config` to its own.
+        # First, because the pipeline overrides `points` and `config`.
         OpaqueFunction(function=lambda context: replay(context, given)),
         pipeline,
     ])

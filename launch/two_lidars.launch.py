@@ -1,4 +1,4 @@
-"""Two sensors, each with a graph of its own in a namespace.
+"""Launch one graph for each of two sensors, each in its own namespace.
 
     ros2 launch lidar_perception two_lidars.launch.py left:=/lidar_left/points \
         right:=/lidar_right/points detectors:=pointpillars
@@ -11,7 +11,11 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchDescription
-from lidar_perception.nodes.launching import ARGUMENTS, given_arguments, refuse_unknown
+from lidar_perception.nodes.launching import (
+    ARGUMENTS,
+    find_given_arguments,
+    reject_unknown_arguments,
+)
 
 GRAPH = Path(__file__).resolve().parent / "detectors.launch.py"
 SIDES = ("left", "right")
@@ -22,10 +26,10 @@ SHARED = {"detectors": "candidates", "single": "false", "tracking": "false",
 
 
 def generate_launch_description():
-    given, known = given_arguments(), {*SIDES, *SHARED, *ARGUMENTS} - {"namespace", "points"}
+    given, known = find_given_arguments(), {*SIDES, *SHARED, *ARGUMENTS} - {"namespace", "points"}
     return LaunchDescription([
-        OpaqueFunction(function=lambda context: refuse_unknown(given, context, known)),
-        *(DeclareLaunchArgument(side, default_value="points", description="Topic of the cloud, in "
+        OpaqueFunction(function=lambda context: reject_unknown_arguments(given, context, known)),
+        *(DeclareLaunchArgument(side, default_value="points", description="Topic of the clouds, in "
                                 f"the namespace {side} unless it starts with /.")
           for side in SIDES),
         *(DeclareLaunchArgument(name, default_value=value, description="See detectors.launch.py.")

@@ -11,10 +11,10 @@ from functools import partial
 from time import monotonic
 from typing import Any
 
+from lidar_perception.nodes.external_node import ExternalNode
 from lidar_perception.nodes.reception import Reception
-from lidar_perception.nodes.runtime import CLOUD, MARKERS, decoded
+from lidar_perception.nodes.runtime import CLOUD, MARKERS, decode_message
 from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, TF_QOS, has_tf
-from lidar_perception.nodes.watch import Outside
 from lidar_perception.params import ReceptionParams
 from lidar_perception.runs.files import shorten_error
 from lidar_perception.types import InputError
@@ -32,7 +32,7 @@ RECEIVED = ReceptionParams(queue=5)
 SAID = "publishers", "silent", "stale", "lost", "dropped"  # of what a Reception finds wrong
 
 
-class LiveView(Outside):
+class LiveView(ExternalNode):
     """Listens from its making on, while run() is called. clouds, boxes: topics that are wanted; ""
     and none: those that live_topics finds."""
 
@@ -53,7 +53,7 @@ class LiveView(Outside):
     def run(self, stop: threading.Event) -> None:
         """Listen until it is told to stop; what goes wrong in that is said on the page."""
         try:
-            self.until(stop.is_set, math.inf, self._each)
+            self.spin_until(stop.is_set, math.inf, self._each)
         except Exception as error:  # of a thread nobody waits for
             self.live.lines = [f"nothing is received any more: {type(error).__name__}: "
                                f"{shorten_error(error)}; start again"]
@@ -106,7 +106,7 @@ class LiveView(Outside):
                 take: Callable[[Any], None]) -> Callable[[bytes], None]:
         def taking(data: bytes) -> None:
             try:
-                take(decoded(data, kind))
+                take(decode_message(data, kind))
                 self.broken.pop(topic, None)
             except Exception as error:  # of whatever anybody sends: it is said, and the next taken
                 self.broken[topic] = f"{topic}: {shorten_error(error)}"

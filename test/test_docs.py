@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from lidar_perception.nodes import NODES, load_node_class
-from lidar_perception.nodes.known import node_parameters
 from lidar_perception.nodes.main import help_text
+from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.param_fields import collect_fields
 
 pytestmark = pytest.mark.no_cover  # others run these lines
@@ -29,8 +29,9 @@ def generate():
 @pytest.mark.parametrize("name", NODES)
 def test_help_of_a_node_names_every_parameter(generate, name):
     text = help_text(name)
-    assert all(f"  {key} (" in text for key in node_parameters(name))
-    assert collect_fields(generate.PAGES[name]["params"]).keys() <= node_parameters(name).keys()
+    assert all(f"  {key} (" in text for key in find_node_parameters(name))
+    documented = collect_fields(generate.PAGES[name]["params"])
+    assert documented.keys() <= find_node_parameters(name).keys()
 
 
 def test_every_node_has_a_page():
@@ -48,15 +49,15 @@ def test_pages_are_made_from_the_code(generate, name):
                                   "pointnet_detector", "fused_detector", "tracker"])
 def test_documented_topics_are_the_nodes_own(generate, name, domain):
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
-    from lidar_perception.nodes.watch import leave, new_context
-    context = new_context(domain)
+    from lidar_perception.nodes.external_node import create_context, shut_down_context
+    context = create_context(domain)
     node = load_node_class(name)(context=context)
     node.start()
     listed = {t for t, _ in [*node.get_publisher_names_and_types_by_node(name, "/"),
                              *node.get_subscriber_names_and_types_by_node(name, "/")]}
     assert {node.resolve_topic_name(f"~/input/{t}") for t in getattr(node, "waits_for", ())} >= {
         reception.topic for reception in node._receptions()}
-    leave(context, node)
+    shut_down_context(context, node)
     documented = set()
     entry = generate.PAGES[name]
     for topics, kind, _ in entry["inputs"] + generate.outputs(name):

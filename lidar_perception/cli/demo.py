@@ -39,7 +39,12 @@ from lidar_perception.detectors.contract import FUSED
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.groups import renumber_ids
 from lidar_perception.nodes import require_rclpy
-from lidar_perception.nodes.graph import ALONE, FINAL, cloud_topic, result_topics
+from lidar_perception.nodes.graph import (
+    FINAL,
+    SINGLE_PROCESS_NODES,
+    cloud_topic,
+    list_result_topics,
+)
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console, errors, show_progress
 from lidar_perception.scoring.centres.matching import match_centres
@@ -67,7 +72,7 @@ def _runs(detector: str) -> Runs:
 @click.command(cls=Command)
 @data_argument(f"Replay this instead of the simulated drive; it needs labelled boxes: {WHAT}",
                required=False)
-@click.option("--detector", type=Choice(ALONE), default=FUSED, show_default=True,
+@click.option("--detector", type=Choice(SINGLE_PROCESS_NODES), default=FUSED, show_default=True,
               help="Detector to run.")
 @out_folder("Folder for the results.", default=Path("out/demo"), show_default=True)
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
@@ -123,7 +128,7 @@ def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: i
         own = _params_of(chosen, played)
     content = replay(drive, clouds, out, own, detector=detector, rate=rate, single=single,
                      real_time=real_time)
-    final = result_topics(single, detector)[FINAL]
+    final = list_result_topics(single, detector)[FINAL]
     found, tracks = answered(out / "result", final, TRACKS)
     calibration = next(iter(played)).calibration()
     if detector == CANDIDATES:

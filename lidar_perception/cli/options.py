@@ -22,7 +22,7 @@ from lidar_perception.detectors.contract import FUSED
 from lidar_perception.detectors.open import DetectorChoice, default_params
 from lidar_perception.detectors.params import RANGE_CHOICES
 from lidar_perception.nodes import NODES
-from lidar_perception.nodes.known import node_parameters
+from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.param_fields import collect_fields, describe_fields, with_values
 from lidar_perception.runs.terminal import errors
 from lidar_perception.tracking.params import TrackingParams
@@ -137,7 +137,7 @@ class SetOption(HelpfulOption):
     def instead_of(self, flag: str) -> str:
         plain = flag.removeprefix("--").removeprefix("no-")
         known = {name.replace(".", "-").replace("_", "-"): name for node in NODES
-                 for name in node_parameters(node)}
+                 for name in find_node_parameters(node)}
         return f"; parameters are given as --set {known[plain]}=VALUE" if plain in known else ""
 
 

@@ -12,7 +12,7 @@ import yaml
 
 from lidar_perception.candidates.configurations import CONFIGURATIONS
 from lidar_perception.nodes import NODES
-from lidar_perception.nodes.known import misspelt
+from lidar_perception.nodes.node_parameters import describe_misspelt_parameters
 from lidar_perception.runs.files import read_text, shorten_error
 from lidar_perception.types import InputError, did_you_mean, valid_names
 
@@ -67,7 +67,7 @@ def read_parameters(path: Path, known: Fields, nodes: Collection[str] | None = N
                 raise InputError(f"{path}: '{name}' is {_wrong_level(name, known)}")
             else:
                 unknown.append(name)
-    return values, [*lines, *misspelt(unknown)]
+    return values, [*lines, *describe_misspelt_parameters(unknown)]
 
 
 def _load(path: Path) -> dict[Any, Any]:

@@ -34,7 +34,7 @@ def load_node_class(name: str) -> Any:
 
 
 def require_rclpy() -> None:
-    """InputError where rclpy is not installed, or cannot be loaded."""
+    """Raise InputError if rclpy is not installed or cannot be loaded."""
     from lidar_perception.types import InputError
     try:
         import rclpy  # noqa: F401

@@ -1,4 +1,4 @@
-"""~/input/points (with `ground` and `cluster_id`) -> ~/output/detections, pedestrian candidates."""
+"""Node that finds pedestrian candidates among clusters: ~/input/points -> ~/output/detections."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["CandidateRefinement", "warm_up"]
 
 
 class CandidateRefinement(ManagedNode):
-    """Ground snapping, height filter, STM and CPA."""
+    """Ground snapping, height filter, STM and CPA on a cloud with `ground` and `cluster_id`."""
 
     def __init__(self, **options: Any):
         super().__init__("candidate_refinement", RefinementNodeParams(),
@@ -41,7 +41,7 @@ class CandidateRefinement(ManagedNode):
             ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
             if clusters is None:
                 raise InputError("the cloud has no column 'cluster_id'; remap ~/input/points to "
-                                 "the clustering's output")
+                                 "the output of the clustering")
             ids, numbers = clusters
             ground = np.zeros(len(ids), bool) if ground is None else ground > 0
             segmented = SegmentedCloud(indices, frame.xyz, ground, ids,

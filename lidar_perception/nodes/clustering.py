@@ -1,4 +1,4 @@
-"""~/input/points (with column `ground`) -> ~/output/points, the same with `cluster_id`."""
+"""Node that clusters obstacles: ~/input/points -> ~/output/points with `cluster_id`."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ __all__ = ["Clustering", "warm_up"]
 
 
 class Clustering(ManagedNode):
-    """Distance-aware DBSCAN or adaptive Euclidean clustering of the points that are not ground.
-    Boxes are made only while somebody subscribes."""
+    """Distance-aware DBSCAN or adaptive Euclidean clustering of the points outside the ground.
+
+    Boxes are computed only while there are subscribers.
+    """
 
     def __init__(self, **options: Any):
         super().__init__("clustering", ClusteringNodeParams(), BoxNodeParams(), **options)
@@ -37,17 +39,17 @@ class Clustering(ManagedNode):
         with self.frame(to_ns(msg.header.stamp)):
             frame, indices = to_frame(msg)
             frame = self.transforms.placing(msg.header).level_frame(frame)
-            marked = read_column(msg, "ground", indices)
-            ground = np.zeros(len(frame), bool) if marked is None else marked > 0
+            column = read_column(msg, "ground", indices)
+            ground = np.zeros(len(frame), bool) if column is None else column > 0
             ids = cluster_obstacles(frame.xyz, ground, self.params.clustering)
             self.points.publish(encode(add_columns(
                 msg, bag_message, cluster_id=scatter_values(ids, indices, msg, "u4"))))
         self.boxes.publish(msg.header, lambda: fit_grounded_boxes(
             frame.xyz, ground, ids, self.params.boxes.shape))
         self.counts["clusters"] = int(ids.max(initial=0))
-        if marked is None:
-            self.report(WARN, "the cloud has no column 'ground', so all of it is clustered; "
-                        "remap ~/input/points to the ground segmentation's output")
+        if column is None:
+            self.report(WARN, "the cloud has no column 'ground', so all points are clustered; "
+                        "remap ~/input/points to the output of the ground segmentation")
         else:
             problem = explain_nothing(len(frame), ground, ids)
             self.report(WARN if problem else OK, problem or "clustering")

@@ -1,4 +1,4 @@
-"""What the nodes with a network share: how it is loaded, run, and spoken of."""
+"""Base class of the detector nodes: loading, running and diagnosing a network."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from msg_utils.stamps import to_ns
 
 
 class DetectorNode(ManagedNode):
-    """~/input/points -> ~/output/detections. A node names its network's group of parameters, finds
-    its weights and loads the detector.
+    """~/input/points -> ~/output/detections.
 
-    Without a network it publishes nothing, as an empty array would mean that nothing is there.
+    A subclass names the parameter group of its network, finds the weights and loads the detector.
+    Without a network the node publishes nothing, as an empty array would mean an empty scene.
     """
 
-    group: ClassVar[str]  # of the parameters, a NetworkParams
-    steps: ClassVar[tuple[str, ...]]  # that are timed
+    group: ClassVar[str]  # name of the parameter group, a NetworkParams
+    steps: ClassVar[tuple[str, ...]]  # timed steps
 
     def configure(self) -> None:
         self.sensor = SensorCheck(self)
         self.outputs = DetectionOutputs(self, self.steps)
         with report_compilation(self.get_logger().info, whole_detector=True):
-            self.detector = self._loaded()
-        name = self.name_of(self.detector.networks[0].config)
+            self.detector = self._load_detector()
+        name = self.describe_network(self.detector.networks[0].config)
         self.counts.update(network=f"{name}, {' '.join(self.detector.classes)}",
                            device=str(self.detector.device))
-        if self.detector.warning:  # beside the state, which says what the node waits for
+        if self.detector.warning:  # not the state, which tells what the node waits for
             self.counts["doubt"] = self.detector.warning
             self.get_logger().warning(self.detector.warning)
         if self.detector.fallback:
@@ -45,70 +45,77 @@ class DetectorNode(ManagedNode):
         self.input("points", CLOUD, self.on_points)
 
     def weights(self) -> Path:
-        """The file of the weights, found without loading torch. InputError if there is none."""
+        """Return the path of the weights, without importing torch.
+
+        Raises:
+            InputError: the file does not exist.
+        """
         raise NotImplementedError
 
     def load(self, weights: Path, device: str) -> Any:
-        """The detector with these weights, warmed up. InputError if they cannot be used."""
+        """Load a detector and warm it up.
+
+        Raises:
+            InputError: the weights cannot be used.
+        """
         raise NotImplementedError
 
-    def name_of(self, config: Any) -> str:
-        """What a network's config is called."""
+    def describe_network(self, config: Any) -> str:
+        """Return the name of a network for the diagnostics."""
         raise NotImplementedError
 
-    def _loaded(self) -> Any:
-        """The detector that the parameters ask for; on the CPU if CUDA is asked for and not there,
-        and the CPU may take over."""
-        chosen, missing = getattr(self.params, self.group), None
+    def _load_detector(self) -> Any:
+        """Load the detector; on the CPU if CUDA is missing and cpu_fallback is set."""
+        network_params, fallback = getattr(self.params, self.group), None
         weights = self.weights()
-        import torch  # takes seconds, so it waits until there are weights
+        import torch  # takes seconds, so only after the weights are found
 
         from lidar_perception.detectors.devices import chosen_device
-        # 0 leaves torch with what main.py sets in the environment, which is one.
-        torch.set_num_threads(chosen.threads or count_cores())
-        device = chosen.device
-        if device.startswith("cuda") and chosen.cpu_fallback:
+        # One thread is the default, by the environment that main.py sets.
+        torch.set_num_threads(network_params.threads or count_cores())
+        device = network_params.device
+        if device.startswith("cuda") and network_params.cpu_fallback:
             try:
                 chosen_device(device)
             except InputError as error:
-                device, missing = "cpu", f"{error}; the CPU is used"
+                device, fallback = "cpu", f"{error}; the CPU is used"
         with lock_compilation(self.get_logger().info):
             detector = self.load(weights, device)
-        detector.fallback = detector.fallback or missing
+        detector.fallback = detector.fallback or fallback
         return detector
 
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, indices, params = self.sensor.frame(msg, with_intensity=True)
+            frame, indices, params = self.sensor.read_frame(msg, with_intensity=True)
             ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
-            own = getattr(params, self.group)
-            detector = self.detector.with_params(self._with_weak(params, own))
-            found = detector(frame, ground=None if ground is None else ground > 0,
-                             cluster_ids=None if clusters is None else clusters[0])
-            weak = found.detections
+            network_params = getattr(params, self.group)
+            detector = self.detector.with_params(self._lower_thresholds(params, network_params))
+            result = detector(frame, ground=None if ground is None else ground > 0,
+                              cluster_ids=None if clusters is None else clusters[0])
+            weak = result.detections
             if self.outputs.tracks is not None:
-                found = replace(found, detections=weak[own.scores.passed(weak)])
-            untracked = self.outputs.publish(msg.header, found.detections, found.timings, frame.xyz,
-                                             weak=weak)
-        self._diagnose(frame, found, params, untracked)
+                result = replace(result, detections=weak[network_params.scores.passed(weak)])
+            tracking_problem = self.outputs.publish(msg.header, result.detections, result.timings,
+                                                    frame.xyz, weak=weak)
+        self._diagnose(frame, result, params, tracking_problem)
 
-    def _with_weak(self, params: Any, own: NetworkParams) -> Any:
-        """params, with thresholds that let through what a tracker needs as well."""
+    def _lower_thresholds(self, params: Any, network_params: NetworkParams) -> Any:
+        """Return params with thresholds that include the weak detections for the tracker."""
         if self.outputs.tracks is None:
             return params
-        low = own.scores.at_most(self.robot.tracking.min_score)
-        return replace(params, **{self.group: replace(own, scores=low)})
+        low = network_params.scores.at_most(self.node_params.tracking.min_score)
+        return replace(params, **{self.group: replace(network_params, scores=low)})
 
-    def _diagnose(self, frame: LidarFrame, found: Found, params: Any,
-                  untracked: str | None) -> None:
-        # The detector's own problem names the intensity, too.
-        problem = joined(found.problem, self.sensor.height_problem(
-            frame, params.ground.sensor_pose), untracked)
-        self.counts.update(detections=len(found.detections), device=str(self.detector.device))
+    def _diagnose(self, frame: LidarFrame, result: Found, params: Any,
+                  tracking_problem: str | None) -> None:
+        # The problem of the detector includes those of the intensity.
+        problem = joined(result.problem, self.sensor.check_height(
+            frame, params.ground.sensor_pose), tracking_problem)
+        self.counts.update(detections=len(result.detections), device=str(self.detector.device))
         self.counts["best scores"] = " ".join(
-            f"{name} {score:.2f}" for name, score in found.best.items())
+            f"{name} {score:.2f}" for name, score in result.best.items())
         if problem:
             self.report(WARN, problem)
         else:
-            self.report(OK, "detecting" if len(found.detections) else "nothing detected: every "
+            self.report(OK, "detecting" if len(result.detections) else "nothing detected: every "
                         f"score is below its threshold in {self.group}.scores")

@@ -1,4 +1,4 @@
-"""~/input/points -> ~/output/detections: cars, pedestrians and cyclists, by several sources."""
+"""Node of the fused detector: ~/input/points -> ~/output/detections."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class FusedNode(DetectorNode):
-    """Reads the columns of PointPillars' experts where the cloud has them."""
+    """Uses the columns `ground` and `cluster_id` if the cloud has them."""
 
     group = "fused"
     steps = STEPS
@@ -49,5 +49,5 @@ class FusedNode(DetectorNode):
         from lidar_perception.detectors.fused.detector import load_fused_detector
         return load_fused_detector(weights, device, self.params)
 
-    def name_of(self, config: NetworkConfig) -> str:
+    def describe_network(self, config: NetworkConfig) -> str:
         return f"PointPillars {config.version} {config.size} and PointNet"

@@ -1,4 +1,7 @@
-"""The graph of nodes: who listens to whom. Launch files and the demo start it from here."""
+"""Graphs of nodes with their topic remappings, and the processes that run them.
+
+Launch files and the demo start their nodes from here.
+"""
 
 from __future__ import annotations
 
@@ -25,140 +28,164 @@ from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POIN
 Graph = Mapping[str, Mapping[str, str]]  # node -> remapping of its topics
 
 
-def relative(topic: str) -> str:
-    """A name that goes along when its node is put into a namespace."""
+def relative_name(topic: str) -> str:
+    """Return the topic without its leading slash, so that it follows the namespace of its node."""
     return topic.lstrip("/")
 
 
-CAMERA = {"~/input/camera_info": relative(CAMERA_INFO), "~/input/extrinsics": relative(EXTRINSICS)}
-TRUTH_IN = {"~/input/ground_truth": relative(TRUTH)}
-CLOUDS = {"~/input/points": relative(POINTS)}
-ODOMETRY_IN = {"~/input/odometry": relative(ODOMETRY)}
+CAMERA = {"~/input/camera_info": relative_name(CAMERA_INFO),
+          "~/input/extrinsics": relative_name(EXTRINSICS)}
+TRUTH_INPUT = {"~/input/ground_truth": relative_name(TRUTH)}
+CLOUDS = {"~/input/points": relative_name(POINTS)}
+ODOMETRY_INPUT = {"~/input/odometry": relative_name(ODOMETRY)}
 TRACKER = "tracker"
 FINAL = "final"  # the last stage of a detector, whose boxes are its detections
 CLUSTERED = {"~/input/points": "clustering/output/points"}
 
-# Ground and clusters, once for all detectors ...
+# Ground and clusters, computed once for all detectors.
 EXPERTS = {
     "ground_segmentation": {**CLOUDS, **CAMERA},
     "clustering": {"~/input/points": "ground_segmentation/output/points"},
 }
-# ... and those behind them: one process a stage, or alone, as each finds both itself.
-BEHIND = {
-    "candidates": {"candidate_refinement": {**CLUSTERED, **TRUTH_IN}},
+# Detector -> its node downstream of EXPERTS ...
+DETECTOR_NODES = {
+    "candidates": {"candidate_refinement": {**CLUSTERED, **TRUTH_INPUT}},
     "pointpillars": {"pointpillars_detector": CLUSTERED},
     "pointnet": {"pointnet_detector": CLUSTERED},
     "fused": {"fused_detector": CLUSTERED},
 }
-ALONE = {
-    "candidates": {"perception": {**CLOUDS, **TRUTH_IN, **CAMERA}},
+# ... and the one that finds ground and clusters itself.
+SINGLE_PROCESS_NODES = {
+    "candidates": {"perception": {**CLOUDS, **TRUTH_INPUT, **CAMERA}},
     "pointpillars": {"pointpillars_detector": CLOUDS},
     "pointnet": {"pointnet_detector": CLOUDS},
     "fused": {"fused_detector": CLOUDS},
 }
 
 
-# The detectors with a network, whose names are those of their groups of parameters.
-NETWORKS = tuple(name for name, nodes in ALONE.items() if f"{name}_detector" in nodes)
+# Detectors with a network; each has a parameter group of the same name.
+NETWORKS = tuple(name for name, nodes in SINGLE_PROCESS_NODES.items()
+                 if f"{name}_detector" in nodes)
 
 
-def graph_of(detectors: Sequence[str], single: bool = False,
+def build_graph(detectors: Sequence[str], single: bool = False,
              tracking: bool = False) -> dict[str, Mapping[str, str]]:
-    """The nodes of one or several detectors, each started once; with tracking a tracker behind each
-    detector. InputError for an unknown one."""
+    """Return the nodes of one or several detectors, each node once.
+
+    Args:
+        detectors: names of detectors, keys of DETECTOR_NODES.
+        single: each detector finds ground and clusters itself, in one process.
+        tracking: add a tracker for each detector.
+
+    Returns:
+        {node: {its topic: remapped topic}}
+
+    Raises:
+        InputError: a detector is unknown.
+    """
     for name in detectors:
-        if name not in BEHIND:
-            raise InputError(f"detectors: '{name}' is none of {', '.join(BEHIND)}")
-    parts = [(ALONE if single else BEHIND)[name] for name in detectors]
+        if name not in DETECTOR_NODES:
+            raise InputError(f"detectors: '{name}' is none of {', '.join(DETECTOR_NODES)}")
+    parts = [(SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[name] for name in detectors]
     if tracking:
-        parts += [{tracker: _tracker_of(name, single)}
-                  for tracker, name in trackers_of(detectors).items()]
+        parts += [{tracker: _remap_tracker(name, single)}
+                  for tracker, name in find_trackers(detectors).items()]
     return {k: v for part in ([] if single else [EXPERTS]) + parts for k, v in part.items()}
 
 
-def trackers_of(detectors: Sequence[str]) -> dict[str, str]:
-    """Name of each tracker -> its detector."""
+def find_trackers(detectors: Sequence[str]) -> dict[str, str]:
+    """Return {name of a tracker: its detector}."""
     return {f"{name}_{TRACKER}" if len(detectors) > 1 else TRACKER: name for name in detectors}
 
 
-def _tracker_of(detector: str, single: bool) -> dict[str, str]:
-    found = f"{last_node(detector, single)}/output/detections"
-    return {"~/input/detections": found, **CLOUDS, **ODOMETRY_IN}
+def _remap_tracker(detector: str, single: bool) -> dict[str, str]:
+    detections = f"{find_result_node(detector, single)}/output/detections"
+    return {"~/input/detections": detections, **CLOUDS, **ODOMETRY_INPUT}
 
 
-def executable_of(node: str) -> str:
-    """What is started under the name of a node of a graph."""
+def find_executable(node: str) -> str:
+    """Return the executable of a node of a graph."""
     return TRACKER if node.endswith(f"_{TRACKER}") else node
 
 
-def prefixed(graph: Graph, prefix: str) -> dict[str, dict[str, str]]:
-    """The same graph with prefix before the names of its nodes, and of the topics between them."""
+def add_node_prefix(graph: Graph, prefix: str) -> dict[str, dict[str, str]]:
+    """Return the graph with a prefix on the names of its nodes and of the topics between them."""
     def renamed(topic: str) -> str:
         return prefix + topic if topic.partition("/")[0] in graph else topic
     return {prefix + node: {a: renamed(b) for a, b in remap.items()}
             for node, remap in graph.items()}
 
 
-STAGES, SINGLE = graph_of(["candidates"]), graph_of(["candidates"], single=True)
-POINTPILLARS, POINTNET = graph_of(["pointpillars"]), graph_of(["pointnet"])
+STAGES, SINGLE = build_graph(["candidates"]), build_graph(["candidates"], single=True)
+POINTPILLARS, POINTNET = build_graph(["pointpillars"]), build_graph(["pointnet"])
 
 
-def last_node(detector: str, single: bool = False) -> str:
-    """The node that publishes what a detector finds."""
-    node, = (ALONE if single else BEHIND)[detector]
+def find_result_node(detector: str, single: bool = False) -> str:
+    """Return the node that publishes the detections of a detector."""
+    node, = (SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[detector]
     return node
 
 
-def result_topics(single: bool = False, detector: str = "candidates") -> dict[str, str]:
-    """Stage -> topic of its detections, without a namespace; the networks have one stage."""
-    node = last_node(detector, single)
+def list_result_topics(single: bool = False, detector: str = "candidates") -> dict[str, str]:
+    """Return {stage: topic of its detections} without a namespace; networks have one stage."""
+    node = find_result_node(detector, single)
     before = ("stage1", "stage2") if detector == "candidates" else ()
     return {**{stage: f"/{node}/debug/{stage}" for stage in before},
             FINAL: f"/{node}/output/detections"}
 
 
 def cloud_topic(single: bool = False, detector: str = "candidates") -> str:
-    """The cloud with all columns that there are."""
+    """Return the topic of the cloud that has all columns."""
     if not single:
         return "/clustering/output/points"
-    return f"/{last_node(detector, True)}/output/points" if detector == "candidates" else POINTS
+    if detector != "candidates":
+        return POINTS
+    return f"/{find_result_node(detector, single)}/output/points"
 
 
-def timing_topics(single: bool = False) -> list[str]:
-    """Times of the nodes, and of the steps that they take apart."""
+def list_timing_topics(single: bool = False) -> list[str]:
+    """Return the topics with the times of the nodes and of their single steps."""
     steps, last = (STEPS, "perception") if single else (STEPS[-3:], "candidate_refinement")
     return [*(f"/{node}/debug/processing_time_ms" for node in (SINGLE if single else STAGES)),
             *(f"/{last}/debug/{step}_ms" for step in steps)]
 
 
-def evaluation(file: Path | str, single: bool = False) -> tuple[dict[str, str], dict[str, Any]]:
-    """Remapping and parameters of an evaluator of all stages."""
-    topics = result_topics(single)
-    remap = TRUTH_IN | {f"~/input/{k}": relative(v) for k, v in topics.items()}
-    return remap, {"stages": list(topics), "timing": [*map(relative, timing_topics(single))],
-                   "file": str(file)}
+def configure_evaluator(file: Path | str, single: bool = False
+                        ) -> tuple[dict[str, str], dict[str, Any]]:
+    """Return the remapping and the parameters of an evaluator of all stages."""
+    topics = list_result_topics(single)
+    remap = TRUTH_INPUT | {f"~/input/{k}": relative_name(v) for k, v in topics.items()}
+    timing = [*map(relative_name, list_timing_topics(single))]
+    return remap, {"stages": list(topics), "timing": timing, "file": str(file)}
 
 
-def outputs_in_use(graph: Graph) -> dict[str, set[str]]:
-    """Node -> those of its topics that another node of the graph listens to, without a
+def find_connected_outputs(graph: Graph) -> dict[str, set[str]]:
+    """Return {node: those of its topics that another node of the graph subscribes to}, without a
     namespace."""
-    heard = {f"/{relative(topic)}" for remap in graph.values() for topic in remap.values()}
-    return {node: {t for t in heard if t.startswith(f"/{node}/")} for node in graph}
+    subscribed = {f"/{relative_name(topic)}"
+                  for remap in graph.values() for topic in remap.values()}
+    return {node: {t for t in subscribed if t.startswith(f"/{node}/")} for node in graph}
 
 
-def wait_for(single: bool = False, points: int = 1, truth: int = 2,
+def list_awaited_topics(single: bool = False, points: int = 1, truth: int = 2,
              detector: str = "candidates") -> list[str]:
-    """bag_player's wait_for: subscribers of the clouds, of the labels (the seed input and an
-    evaluator), and one of each topic between the nodes and of each result."""
-    between = sorted(set().union(*outputs_in_use(graph_of([detector], single)).values()))
+    """Return the parameter wait_for of bag_player for a graph.
+
+    It waits for subscribers of the clouds and of the labels (the seed input and an evaluator), and
+    for one subscriber of each result and of each topic between the nodes.
+    """
+    between = sorted(set().union(*find_connected_outputs(build_graph([detector], single)).values()))
     topics = [f"{POINTS}:={points}", f"{TRUTH}:={truth}", *between,
-              *result_topics(single, detector).values()]
-    return [*map(relative, topics)]
+              *list_result_topics(single, detector).values()]
+    return [*map(relative_name, topics)]
 
 
-def chosen_clouds(bag: str, types: Mapping[str, str], wanted: str = "") -> str:
-    """The topic of a bag with clouds: the wanted one, or with '' the only one. InputError names
-    those that there are."""
+def choose_cloud_topic(bag: str, types: Mapping[str, str], wanted: str = "") -> str:
+    """Return the cloud topic of a bag: the wanted one, or the only one if wanted is empty.
+
+    Raises:
+        InputError: there is no such topic, or there are several; the message lists them.
+    """
     clouds = find_cloud_topics(types)
     if wanted in clouds or (not wanted and len(clouds) == 1):
         return wanted or clouds[0]
@@ -170,30 +197,35 @@ def chosen_clouds(bag: str, types: Mapping[str, str], wanted: str = "") -> str:
                      f"{bag}: give the topic of the clouds with points:=TOPIC; {has}")
 
 
-_taken: list[Any] = []  # locks on the files of our domains, until this process ends
+_domain_locks: list[Any] = []  # open lock files of our domains, until this process ends
 
 
-def private_domain() -> int:
-    """A ROS domain that nobody on this machine uses: 1..100, as the ports of higher ones are also
-    handed out to other programs. It stays this process's own while none of its nodes runs."""
+def reserve_domain() -> int:
+    """Reserve an unused ROS domain from 1 to 100 on this machine, until this process ends.
+
+    The ports of higher domains are ephemeral ports of other programs.
+
+    Raises:
+        InputError: all domains are in use.
+    """
     for domain in random.SystemRandom().sample(range(1, 101), 100):
         name = f"lidar_perception-{os.getuid()}-domain-{domain}.lock"
         lock = open(Path(tempfile.gettempdir()) / name, "w")
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                # Where the domain's first participant listens (RTPS 2.5, Section 9.6.2.3).
+                # Port of the first participant in the domain (RTPS 2.5, Section 9.6.2.3).
                 probe.bind(("", 7410 + 250 * domain))
             except OSError:
                 lock.close()
                 continue
-        _taken.append(lock)
+        _domain_locks.append(lock)
         return domain
     raise InputError("all ROS domains 1..100 are in use on this machine")
 
 
 class Processes:
-    """Node processes with logs in a folder; a context manager that ends them with SIGINT."""
+    """Context manager for node processes that log to a folder; it ends them with SIGINT."""
 
     def __init__(self, logs: Path, domain: int | None = None):
         self.logs = logs
@@ -209,31 +241,31 @@ class Processes:
 
     def start(self, node: str, remap: Mapping[str, str], params: Mapping[str, Any],
               namespace: str = "") -> None:
-        """Start a node of a graph; in a namespace it is called NAMESPACE.NODE here."""
+        """Start a node of a graph; with a namespace its key in `running` is NAMESPACE.NODE."""
         values = {k: list(v) if isinstance(v, tuple) else v for k, v in params.items()}
         values = {k: v for k, v in values.items() if v != []}  # an empty list has no type in YAML
         name = f"{namespace}.{node}" if namespace else node
         file = self.logs / f"{name}.param.yaml"
         file.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}))
         rules = {**remap, **({"__ns": f"/{namespace}"} if namespace else {}),
-                 **({"__node": node} if executable_of(node) != node else {})}
+                 **({"__node": node} if find_executable(node) != node else {})}
         remapping = [word for rule in rules.items() for word in ("-r", ":=".join(rule))]
-        self.run_node(name, [executable_of(node), "--ros-args", "--params-file", str(file),
+        self.run_node(name, [find_executable(node), "--ros-args", "--params-file", str(file),
                              *remapping])
 
     def run_node(self, name: str, arguments: Sequence[str]) -> None:
-        """Start one of our executables."""
+        """Start one of the executables of this package."""
         self.run(name, [sys.executable, "-m", "lidar_perception.nodes.main", *arguments])
 
     def run(self, name: str, command: Sequence[str]) -> None:
-        """Start any program; what it writes goes to the log."""
+        """Start any program with its output in the log file."""
         with open(self.logs / f"{name}.log", "w") as log:
             self.running[name] = subprocess.Popen(
                 command, env=self.environment, stdin=subprocess.DEVNULL, stdout=log,
                 stderr=subprocess.STDOUT)
 
     def check(self, *finished: str) -> None:
-        """InputError with the last line of its log, if a node other than `finished` has ended."""
+        """Raise InputError with the last log line if a node that is not in `finished` has ended."""
         for node, process in self.running.items():
             code = process.poll()
             if code is not None and (node not in finished or code):
@@ -241,11 +273,11 @@ class Processes:
                 raise InputError(f"{node} ended with code {code}: {lines[-1]} "
                                  f"(log: {self.logs / node}.log)")
 
-    def ended(self, node: str) -> bool:
+    def has_ended(self, node: str) -> bool:
         return self.running[node].poll() is not None
 
     def memory_mb(self) -> dict[str, float]:
-        """Proportional set size of each running node, in megabytes; empty where /proc is not."""
+        """Return the proportional set size of each running node in MB; empty without /proc."""
         sizes = {}
         for node, process in self.running.items():
             try:
@@ -256,7 +288,7 @@ class Processes:
         return sizes
 
     def stop(self, timeout: float = 5.0) -> dict[str, int]:
-        """SIGINT to all, SIGKILL after timeout seconds; returns the exit codes."""
+        """Send SIGINT to all processes, SIGKILL after timeout seconds; return the exit codes."""
         for process in self.running.values():
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)

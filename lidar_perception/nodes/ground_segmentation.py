@@ -1,4 +1,4 @@
-"""~/input/points -> ~/output/points, the same cloud with the columns `ground` and `in_view`."""
+"""Node that segments the ground: ~/input/points -> ~/output/points with `ground` and `in_view`."""
 
 from __future__ import annotations
 
@@ -23,8 +23,10 @@ __all__ = ["GroundSegmentation", "warm_up"]
 
 
 class GroundSegmentation(ManagedNode):
-    """One plane, Patchwork++ or cloth simulation. ~/output/ground, nonground and obstacles are made
-    only while somebody subscribes."""
+    """Plane fit, Patchwork++ or cloth simulation.
+
+    ~/output/ground, nonground and obstacles are computed only while there are subscribers.
+    """
 
     def __init__(self, **options: Any):
         super().__init__("ground_segmentation", GroundNodeParams(), GroundRobotParams(), **options)
@@ -36,14 +38,14 @@ class GroundSegmentation(ManagedNode):
         self.ground = self.output("ground", CLOUD)
         self.nonground = self.output("nonground", CLOUD)
         self.obstacles = Obstacles(self)
-        self.input("points", CLOUD, self.on_points, needs=self.camera.missing)
+        self.input("points", CLOUD, self.on_points, needs=self.camera.find_missing_input)
 
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, usable, params = self.sensor.frame(msg)
+            frame, usable, params = self.sensor.read_frame(msg)
             camera = self.camera.get(msg.header, params.view)
-            indices, seen = crop_to_view(frame, camera, params.view)
-            ground = segment_ground(seen, params.ground)
+            indices, visible_frame = crop_to_view(frame, camera, params.view)
+            ground = segment_ground(visible_frame, params.ground)
             indices = usable.take(indices)
             self.points.publish(encode(add_columns(
                 msg, bag_message, ground=scatter_values(ground, indices, msg, "u1"),
@@ -52,11 +54,12 @@ class GroundSegmentation(ManagedNode):
             if publisher.get_subscription_count():
                 publisher.publish(encode(from_array(to_array(msg).take(indices[chosen]), msg.header,
                                                     bag_message)))
-        self.obstacles.publish(msg, seen.xyz, ground, indices)
-        plane = fit_plane(seen.xyz.compress(ground, axis=0))
+        self.obstacles.publish(msg, visible_frame.xyz, ground, indices)
+        plane = fit_plane(visible_frame.xyz.compress(ground, axis=0))
         if plane is not None:
+            share = compute_inlier_share(visible_frame.xyz, plane)
             self.counts.update(plane=" ".join(f"{v:.4f}" for v in plane),
-                               plane_inlier_share=f"{compute_inlier_share(seen.xyz, plane):.3f}",
+                               plane_inlier_share=f"{share:.3f}",
                                ground_share=f"{ground.mean():.3f}")
-        problem = explain_nothing(len(frame), ground) or self.sensor.problem(frame, params)
+        problem = explain_nothing(len(frame), ground) or self.sensor.find_problem(frame, params)
         self.report(WARN if problem else OK, problem or "segmenting")

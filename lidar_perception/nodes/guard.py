@@ -1,4 +1,4 @@
-"""A compiled thread that ends the process after a signal, even when DDS is stuck."""
+"""Compiled thread that ends the process after a signal, even while DDS is stuck."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import threading
 import numpy as np
 from numba import njit, types
 
-REACTION = 5.0  # seconds for the current work; a stuck one is not waited for
-# Seconds for DDS to be taken down, after all is written. Cut short, it may leave a port in shared
-# memory that others wait for. launch sends SIGTERM after 5 s.
-TEARDOWN = 3.0
+REACTION_S = 5.0  # for the current work
+# For the shutdown of DDS after the results are written. An interrupted one may leave a port in
+# shared memory that others wait for. launch sends SIGTERM after 5 s.
+TEARDOWN_S = 3.0
 RUNNING, CLOSING, CLOSED = range(3)
-TICK = 0.02  # seconds
+TICK_S = 0.02
 
 SIGINFO = 128  # bytes of one signal, struct signalfd_siginfo
 
@@ -23,13 +23,18 @@ _exit = types.ExternalFunction("_exit", types.void(types.int32))
 
 
 def start_guard(signals: int, pipe: int) -> np.ndarray:
-    """Start the thread that reads the first signal from the descriptor `signals`, see signalfd(2).
+    """Start a thread that ends the process after the first signal.
 
-    It writes a byte to the pipe then. From there the process has REACTION seconds until its state
-    is CLOSING, any time until it is CLOSED, and TEARDOWN seconds from there to its end.
+    The thread reads the signal and writes a byte to the pipe. The process then has REACTION_S
+    seconds until its state is CLOSING, unlimited time until it is CLOSED, and TEARDOWN_S seconds
+    until its end.
+
+    Args:
+        signals: descriptor of signalfd(2).
+        pipe: descriptor of the writing end.
 
     Returns:
-        (2,) int64 state that the caller sets: the phase, and the exit code once it is CLOSED.
+        (2,) int64 state for the caller to set: phase, and exit code when CLOSED.
     """
     state = np.array([RUNNING, 0], np.int64)
     threading.Thread(target=_guard, args=(state, signals, pipe), daemon=True).start()
@@ -40,15 +45,15 @@ def start_guard(signals: int, pipe: int) -> np.ndarray:
 def _guard(state, signals, pipe):
     signal = np.zeros(SIGINFO, np.uint8)
     while _read(signals, signal.ctypes.data, SIGINFO) < 0:
-        _usleep(int(TICK * 1e6))
+        _usleep(int(TICK_S * 1e6))
     _write(pipe, signal.ctypes.data, 1)
     waited = 0.0
     while state[0] == RUNNING:
-        if waited > REACTION:
+        if waited > REACTION_S:
             _exit(0)
-        _usleep(int(TICK * 1e6))
-        waited += TICK
+        _usleep(int(TICK_S * 1e6))
+        waited += TICK_S
     while state[0] == CLOSING:
-        _usleep(int(TICK * 1e6))
-    _usleep(int(TEARDOWN * 1e6))
+        _usleep(int(TICK_S * 1e6))
+    _usleep(int(TEARDOWN_S * 1e6))
     _exit(state[1])

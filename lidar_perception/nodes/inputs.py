@@ -1,4 +1,4 @@
-"""Inputs that several nodes share: the camera, and messages that belong to one cloud."""
+"""Inputs shared by several nodes: the camera, and seeds for each cloud."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lidar_perception.candidates.seed_sources import (
 )
 from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
-from lidar_perception.nodes.graph import relative
+from lidar_perception.nodes.graph import relative_name
 from lidar_perception.nodes.runtime import (
     JUMP_NS,
     LATCHED,
@@ -46,7 +46,7 @@ class CameraInput:
         self.node = node
         self.info: Any = None
         self.transforms: dict[tuple[str, str], Any] = {}
-        # A latched subscription gets what was sent before, but nothing of a camera driver, which is
+        # A latched subscription gets earlier messages, but none of a camera driver, which publishes
         # volatile and often best effort.
         node.input("camera_info", "sensor_msgs/msg/CameraInfo", self._on_info, LATCHED,
                    SENSOR_DATA)
@@ -59,50 +59,56 @@ class CameraInput:
     def _on_transform(self, msg: Any) -> None:
         self.transforms[msg.header.frame_id, msg.child_frame_id] = msg
 
-    def missing(self, cloud: Any) -> str | None:
-        """What a cloud waits for; None if it can be cropped, or is not to be."""
+    def find_missing_input(self, cloud: Any) -> str | None:
+        """Return what a cloud waits for; None if it can be cropped, or need not be."""
         params = self.node.params.view
         if not params.enabled or self.get(cloud.header, params) is not None:
             return None
         info, extrinsics = map(self.node.resolve_topic_name, (
             "~/input/camera_info", "~/input/extrinsics"))
         return "the camera's calibration: " + (
-            f"no CameraInfo has come on {info}" if self.info is None else
+            f"no CameraInfo on {info}" if self.info is None else
             f"neither {extrinsics} nor TF connects the cloud's '{cloud.header.frame_id}' with the "
             f"CameraInfo's '{self.info.header.frame_id}'")
 
     def get(self, header: Any, params: ViewParams) -> Camera | None:
-        """The camera for the levelled points of a cloud with this header; None until it is known
-        where it is, and while view is off."""
+        """Return the camera for the levelled points of a cloud, or None.
+
+        None while view is disabled, and until the pose of the camera is available.
+        """
         if not params.enabled or self.info is None:
             return None
         lidar, camera = header.frame_id, self.info.header.frame_id
         transform = self.transforms.get((lidar, camera)) or self.transforms.get((camera, lidar))
         level = self.node.transforms.placing(header).level
         if transform is not None:
-            found = read_camera(self.info, transform)
+            result = read_camera(self.info, transform)
         else:
             try:
                 pose = self.node.transforms.tree.lookup(camera, lidar, to_ns(header.stamp))
             except MissingTransform:
-                self.node.transforms.listen()
+                self.node.transforms.subscribe_to_tf()
                 return None
-            found = make_calibration(self.info, pose).camera()
-        return found if level is None else replace(
-            found, projection=found.projection @ invert_pose(level))
+            result = make_calibration(self.info, pose).camera()
+        return result if level is None else replace(
+            result, projection=result.projection @ invert_pose(level))
 
 
-class Paired:
-    """Clouds that wait for the message with the same stamp from another topic.
+class StampMatcher:
+    """Matches clouds with the messages of another topic that have the same stamp.
 
-    A cloud is given out with its partner; without one when a later partner or too many clouds
-    have come, as then its own is lost. When time goes back, what is from before is dropped, and
-    dropped told how many clouds that are.
+    A cloud is delivered with its partner, or without one if a later partner or too many clouds have
+    arrived. If time jumps back, all pending messages are dropped.
+
+    Args:
+        deliver: called with a cloud and its partner or None.
+        capacity: number of clouds that may wait.
+        on_drop: called with the number of dropped clouds.
     """
 
     def __init__(self, deliver: Callable[[Any, Any], None], capacity: int = 5,
-                 dropped: Callable[[int], None] = lambda _: None):
-        self.deliver, self.capacity, self.dropped = deliver, capacity, dropped
+                 on_drop: Callable[[int], None] = lambda _: None):
+        self.deliver, self.capacity, self.on_drop = deliver, capacity, on_drop
         self.clouds: OrderedDict[int, Any] = OrderedDict()
         self.partners: OrderedDict[int, Any] = OrderedDict()
 
@@ -130,44 +136,44 @@ class Paired:
             self.deliver(cloud, partner)
 
     def clear(self) -> None:
-        """Drop all that waits."""
+        """Drop all pending messages."""
         self._drop_later(-JUMP_NS - 1)
 
     def _drop_later(self, stamp_ns: int) -> None:
-        """Drop all if the last of them is from before a jump back to stamp_ns."""
-        for waiting in (self.clouds, self.partners):
-            if waiting and next(reversed(waiting)) > stamp_ns + JUMP_NS:
-                if waiting is self.clouds:
-                    self.dropped(len(waiting))
-                waiting.clear()
+        """Drop all pending messages if the last one is from before a jump back to stamp_ns."""
+        for pending in (self.clouds, self.partners):
+            if pending and next(reversed(pending)) > stamp_ns + JUMP_NS:
+                if pending is self.clouds:
+                    self.on_drop(len(pending))
+                pending.clear()
 
 
 class SeedInput:
-    """The seed pedestrian of each cloud, from the source that the parameters name.
+    """Provides the seed pedestrian for each cloud, from the source in the parameters.
 
-    deliver(cloud message, seed source) is called for each cloud, in order. The source raises
-    InputError where there is no seed yet.
+    deliver(cloud message, seed source) is called for each cloud, in order. The seed source raises
+    InputError while there is no seed.
     """
 
     def __init__(self, node: LidarNode, deliver: Callable[[Any, SeedSource], None]):
         self.node, self.deliver = node, deliver
         self.click: Any = None
-        self.clicked: Seed | None = None
-        self.loaded: tuple[str, Seed] | None = None
-        self.paired = Paired(self._deliver_with_truth, dropped=self._count)
+        self.clicked_seed: Seed | None = None
+        self.loaded_template: tuple[str, Seed] | None = None
+        self.matcher = StampMatcher(self._deliver_with_truth, on_drop=self._count_dropped)
         node.input("ground_truth", MARKERS, self._on_truth, RELIABLE)
-        node.input(relative(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE,
+        node.input(relative_name(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE,
                    private=False)
         node.inputs.append(self)
         if self.params.source in ("file", "automatic"):
-            self._template()  # a missing one is known before the first cloud
+            self._load_template()  # reports a missing file before the first cloud
 
     def open(self) -> None:
-        """The node is active."""
+        """Do nothing: the subscriptions of the node are opened by the node."""
 
     def close(self) -> None:
-        """The node is not active any more: what waits is too old when it is again."""
-        self.paired.clear()
+        """Drop pending messages, which would be too old when the node is active again."""
+        self.matcher.clear()
 
     @property
     def params(self) -> SeedParams:
@@ -175,36 +181,36 @@ class SeedInput:
 
     def add_cloud(self, msg: Any) -> None:
         if self.params.source == "ground_truth":
-            self.paired.add_cloud(to_ns(msg.header.stamp), msg)
+            self.matcher.add_cloud(to_ns(msg.header.stamp), msg)
         elif self.params.source == "click":
-            self.deliver(msg, partial(self._from_click, msg.header))
+            self.deliver(msg, partial(self._make_clicked_seed, msg.header))
         else:
-            self.deliver(msg, self._from_file)
+            self.deliver(msg, self._make_file_seed)
 
-    def _template(self) -> Seed:
-        if self.loaded is None or self.loaded[0] != self.params.file:
-            self.loaded = (self.params.file, load_seed(self.params.file))
-        return self.loaded[1]
+    def _load_template(self) -> Seed:
+        if self.loaded_template is None or self.loaded_template[0] != self.params.file:
+            self.loaded_template = (self.params.file, load_seed(self.params.file))
+        return self.loaded_template[1]
 
-    def _from_file(self, segmented: SegmentedCloud) -> Seed:
-        template = self._template()
+    def _make_file_seed(self, segmented: SegmentedCloud) -> Seed:
+        template = self._load_template()
         return template if self.params.source == "file" else make_automatic_source(
             template, self.node.params)(segmented)
 
     def _on_truth(self, msg: Any) -> None:
         objects = from_marker_array(msg)
         if not objects.stamp_ns:
-            raise InputError("labels without a header.stamp belong to no cloud; send a DELETEALL "
-                             "with the header of the frame where nothing is labelled")
-        self.paired.add_partner(objects.stamp_ns, to_truth(objects))
+            raise InputError("labels without a header.stamp match no cloud; for a frame without "
+                             "objects send a DELETEALL with its header")
+        self.matcher.add_partner(objects.stamp_ns, to_truth(objects))
 
-    def _count(self, dropped: int) -> None:
+    def _count_dropped(self, dropped: int) -> None:
         self.node.counts["dropped"] = self.node.counts.get("dropped", 0) + dropped
 
     def _deliver_with_truth(self, cloud: Any, truth: Any) -> None:
         if truth is None:
-            self.deliver(cloud, _missing("no ground truth with the stamp of this cloud; is it "
-                                         "published, with the same header.stamp?"))
+            self.deliver(cloud, _raise_missing("no ground truth with the stamp of this cloud; is "
+                                               "it published, with the same header.stamp?"))
         else:
             people = truth.of_class(PEDESTRIAN)
             level = self.node.transforms.placing(cloud.header).level
@@ -212,13 +218,13 @@ class SeedInput:
                                                   else transform_boxes(people, level)))
 
     def _on_click(self, msg: Any) -> None:
-        self.click, self.clicked = msg, None
+        self.click, self.clicked_seed = msg, None
 
-    def _from_click(self, header: Any, segmented: SegmentedCloud) -> Seed:
+    def _make_clicked_seed(self, header: Any, segmented: SegmentedCloud) -> Seed:
         if self.click is None:
             raise InputError("no seed yet: click a pedestrian (a PointStamped on "
-                             f"{relative(CLICK)}, as RViz and Foxglove publish it)")
-        if self.clicked is None:
+                             f"{relative_name(CLICK)}, as RViz and Foxglove publish it)")
+        if self.clicked_seed is None:
             p, frame_id = self.click.point, self.click.header.frame_id
             try:
                 pose = self.node.transforms.to_level(header, frame_id)
@@ -227,13 +233,13 @@ class SeedInput:
                                  f"'{header.frame_id}' ({error}); set that as the fixed frame and "
                                  "click again") from None
             point = transform_points(np.array([[p.x, p.y, p.z]]), pose)[0]
-            self.clicked = make_click_source(point, self.params)(segmented)
-            self.node.get_logger().info(f"seed taken at ({p.x:.1f}, {p.y:.1f}, {p.z:.1f}), height "
-                                        f"{self.clicked.height:.2f} m")
-        return self.clicked
+            self.clicked_seed = make_click_source(point, self.params)(segmented)
+            self.node.get_logger().info(f"seed selected at ({p.x:.1f}, {p.y:.1f}, {p.z:.1f}), "
+                                        f"height {self.clicked_seed.height:.2f} m")
+        return self.clicked_seed
 
 
-def _missing(reason: str) -> SeedSource:
+def _raise_missing(reason: str) -> SeedSource:
     def source(segmented: SegmentedCloud) -> Seed:
         raise InputError(reason)
     return source

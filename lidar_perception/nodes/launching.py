@@ -1,7 +1,7 @@
-"""Arguments shared by all launch files, and one process for each node.
+"""Arguments and nodes of the launch files; each node is one process.
 
 The parameters of a node come from the package's own file, then from the files that the user gives,
-then from the other arguments; the later ones win.
+then from the other arguments; later values override earlier ones.
 """
 
 from __future__ import annotations
@@ -20,22 +20,27 @@ from launch_ros.actions import Node
 from launch import LaunchDescription
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.graph import (
-    ALONE,
-    BEHIND,
+    DETECTOR_NODES,
     EXPERTS,
     NETWORKS,
-    ODOMETRY_IN,
+    ODOMETRY_INPUT,
     SINGLE,
+    SINGLE_PROCESS_NODES,
     STAGES,
     TRACKER,
-    executable_of,
-    graph_of,
-    prefixed,
-    relative,
-    trackers_of,
+    add_node_prefix,
+    build_graph,
+    find_executable,
+    find_trackers,
+    relative_name,
 )
-from lidar_perception.nodes.known import node_parameters
-from lidar_perception.nodes.param_files import EVERY_NODE, is_for, read_sections, unknown_nodes
+from lidar_perception.nodes.node_parameters import find_node_parameters
+from lidar_perception.nodes.param_files import (
+    EVERY_NODE,
+    describe_unknown_nodes,
+    is_for,
+    read_sections,
+)
 from lidar_perception.param_fields import flatten
 from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
 from lidar_perception.types import InputError, unknown_name
@@ -44,88 +49,95 @@ from lidar_perception.wire.topics import ODOMETRY, POINTS
 CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet",
            "fused": "fused"}
 
-OF_LAUNCH = ("launch-prefix", "launch-prefix-filter")  # arguments that launch itself takes
-RESPAWN_DELAY = 2.0  # seconds, so that a node that cannot start does not fill the log
+LAUNCH_ARGUMENTS = ("launch-prefix", "launch-prefix-filter")  # arguments of launch itself
+RESPAWN_DELAY_S = 2.0  # keeps a node that cannot start from filling the log
 
 SWITCHES: dict[str, Any] = dict(default_value="false", choices=["true", "false"])
 ARGUMENTS: dict[str, dict[str, Any]] = {
-    "namespace": dict(default_value="", description="Of all nodes and topics, for one of several "
-                      "sensors; /diagnostics, /tf and /clock stay outside."),
-    "name_prefix": dict(default_value="", description="Before the name of each node."),
-    "points": dict(default_value=relative(POINTS), description="The cloud's topic."),
-    "reliability": dict(default_value="", description="auto, reliable or best_effort, for the "
-                        "parameter input.reliability; empty: that of the parameter file."),
+    "namespace": dict(default_value="", description="Namespace of all nodes and topics, for one of "
+                      "several sensors; /diagnostics, /tf and /clock stay global."),
+    "name_prefix": dict(default_value="", description="Prefix of all node names."),
+    "points": dict(default_value=relative_name(POINTS), description="Topic of the clouds."),
+    "reliability": dict(default_value="", description="Parameter input.reliability: auto, reliable "
+                        "or best_effort; empty: as in the parameter file."),
     "base_frame": dict(default_value="", description="Parameter base_frame: the mounting comes "
-                       "from TF; empty: that of the parameter file."),
-    "target_frame": dict(default_value="", description="Parameter target_frame: of the boxes that "
-                         "go out; empty: that of the parameter file."),
+                       "from TF; empty: as in the parameter file."),
+    "target_frame": dict(default_value="", description="Parameter target_frame: frame of the "
+                         "published boxes; empty: as in the parameter file."),
     "deskew": dict(default_value="", choices=["", "off", "odometry", "tf"], description="Parameter "
-                   "input.deskew: clouds are moved to their stamp; empty: that of the parameter "
+                   "input.deskew: motion compensation of the clouds; empty: as in the parameter "
                    "file."),
-    "ahead": dict(default_value="", description="Parameter input.ahead: where the detectors look, "
-                  "degrees from the clouds' x axis; empty: that of the parameter file."),
+    "ahead": dict(default_value="", description="Parameter input.ahead: viewing direction of the "
+                  "detectors, degrees from the x axis of the clouds; empty: as in the parameter "
+                  "file."),
     "range": dict(default_value="", choices=["", "auto", "ahead", "around"],
-                  description="Parameter range of fused and pointpillars: what they see; empty: "
-                  "that of the parameter file."),
-    "config": dict(default_value="", description="Parameter files of all nodes, with commas, on "
-                   "top of config/*.param.yaml of each detector."),
-    "experts": dict(default_value="", description="Of ground and clusters: the detector whose "
-                    "config/*.param.yaml they take, empty: the first; or a parameter file on top "
-                    "of all others."),
-    "weights": dict(default_value="", description="Checkpoint of the network, with several "
-                    "networks NAME=FILE,NAME=FILE; empty: that of the parameter file, or the one "
-                    "that comes with the package."),
-    "device": dict(default_value="", description="auto, cpu, cuda, cuda:N of the networks; empty: "
-                   "that of the parameter file."),
-    "tracking": dict(**SWITCHES, description="Tracks of what each detector finds: a tracker behind "
-                     "each; with `single` in the detector's process."),
-    "odometry": dict(default_value=relative(ODOMETRY), description="Topic of the odometry, for "
+                  description="Parameter range of fused and pointpillars: detection range; empty: "
+                  "as in the parameter file."),
+    "config": dict(default_value="", description="Comma-separated parameter files for all nodes, "
+                   "loaded after config/*.param.yaml of each detector."),
+    "experts": dict(default_value="", description="Parameters of ground and clusters: name of the "
+                    "detector whose config/*.param.yaml they use (empty: the first one), or a "
+                    "parameter file that is loaded last."),
+    "weights": dict(default_value="", description="Checkpoint of the network, NAME=FILE,NAME=FILE "
+                    "for several networks; empty: as in the parameter file, or the packaged one."),
+    "device": dict(default_value="", description="Device of the networks: auto, cpu, cuda or "
+                   "cuda:N; empty: as in the parameter file."),
+    "tracking": dict(**SWITCHES, description="Track the detections of each detector, in a tracker "
+                     "node; with `single` in the process of the detector."),
+    "odometry": dict(default_value=relative_name(ODOMETRY), description="Topic of the odometry for "
                      "the trackers and deskew."),
-    "single": dict(**SWITCHES, description="Each detector in one process, which finds ground and "
+    "single": dict(**SWITCHES, description="Run each detector in one process that finds ground and "
                    "clusters itself."),
     "autostart": dict(default_value="true", choices=["true", "false"], description="false: a "
                       "lifecycle manager configures and activates the nodes."),
-    "respawn": dict(**SWITCHES, description="Start a node again when it has ended, as after a "
+    "respawn": dict(**SWITCHES, description="Restart a node that has ended, for example after a "
                     "crash; with autostart:=false it is not configured then."),
-    "rviz": dict(**SWITCHES, description="Start RViz with config/lidar_perception.rviz, in the "
+    "rviz": dict(**SWITCHES, description="Start RViz with config/lidar_perception.rviz in the "
                  "same namespace."),
-    "rviz_frame": dict(default_value="", description="Fixed frame of RViz; empty: that of its "
-                       "file, velodyne."),
+    "rviz_frame": dict(default_value="", description="Fixed frame of RViz; empty: velodyne, as "
+                       "in the RViz file."),
     "use_sim_time": dict(default_value="", choices=["", "true", "false"], description="Take the "
-                         "time from /clock; empty: that of the parameter file, else false."),
+                         "time from /clock; empty: as in the parameter file, else false."),
     "log_level": dict(default_value="info", description="debug, info, ..."),
 }
 
 
-def graph_launch(config_folder: Path, detectors: str) -> LaunchDescription:
-    """Ground and clusters, once, and the detectors behind them: a list with commas, the default of
-    the argument `detectors`. ARGUMENTS are the others."""
-    given = given_arguments()
+def make_launch_description(config_folder: Path, detectors: str) -> LaunchDescription:
+    """Describe the launch of ground segmentation, clustering and detectors.
+
+    Args:
+        config_folder: folder with the parameter files of the package.
+        detectors: default of the launch argument `detectors`, comma-separated; the others are
+            ARGUMENTS.
+    """
+    given = find_given_arguments()
 
     def nodes(context: Any) -> list[Any]:
-        refuse_unknown(given, context, ["detectors", *ARGUMENTS])
+        reject_unknown_arguments(given, context, ["detectors", *ARGUMENTS])
         value = {k: context.perform_substitution(LaunchConfiguration(k))
                  for k in ("detectors", *ARGUMENTS)}
-        processes = started(value, config_folder)
-        lines = [f"warning: {line}" for file in parameter_files(value["config"], value["experts"])
-                 for line in unknown_nodes(file, _graph(value))]
-        return [*(LogInfo(msg=line) for line in [*lines, *conflicts(value, config_folder)]),
-                *processes]
+        processes = create_nodes(value, config_folder)
+        files = list_parameter_files(value["config"], value["experts"])
+        lines = [f"warning: {line}" for file in files
+                 for line in describe_unknown_nodes(file, _graph(value))]
+        lines += describe_conflicts(value, config_folder)
+        return [*(LogInfo(msg=line) for line in lines), *processes]
 
     return LaunchDescription([
         DeclareLaunchArgument("detectors", default_value=detectors,
-                              description=f"One or several of {','.join(BEHIND)}."),
+                              description="Comma-separated detectors: "
+                              f"{', '.join(DETECTOR_NODES)}."),
         *(DeclareLaunchArgument(name, **what) for name, what in ARGUMENTS.items()),
         OpaqueFunction(function=nodes),
     ])
 
 
-def given_arguments() -> list[Any]:
-    """Return the names of the arguments that are given to the launch file that calls this, on the
-    command line or by the file that includes it; text, or substitutions of launch.
+def find_given_arguments() -> list[Any]:
+    """Return the names of the arguments given to the launch file that calls this function.
 
-    Only the IncludeLaunchDescription that loads the file knows them. In the context they are among
-    the launch configurations of all other files.
+    They come from the command line or from the including file, as text or as launch substitutions.
+    Only the IncludeLaunchDescription that loads the file knows them: the launch context mixes them
+    with the launch configurations of all other files.
     """
     frame: Any = sys._getframe()
     while frame is not None:
@@ -136,65 +148,67 @@ def given_arguments() -> list[Any]:
     return []
 
 
-def refuse_unknown(given: list[Any], context: Any, known: Collection[str]) -> None:
-    """Raise InputError for the first name that is not an argument; it names the closest one."""
+def reject_unknown_arguments(given: list[Any], context: Any, known: Collection[str]) -> None:
+    """Raise InputError for the first name that is not an argument, with the closest valid name."""
     for parts in given:
         name = "".join(part if isinstance(part, str) else context.perform_substitution(part)
                        for part in (parts if isinstance(parts, list | tuple) else [parts]))
-        if name in known or name in OF_LAUNCH:
+        if name in known or name in LAUNCH_ARGUMENTS:
             continue
-        if nodes := [node for node in NODES if name in node_parameters(node)]:
+        if nodes := [node for node in NODES if name in find_node_parameters(node)]:
             raise InputError(f"'{name}' is not a launch argument but a parameter of "
                              f"{', '.join(nodes)}; set it in a parameter file, config:=FILE")
         raise unknown_name("launch argument", name, sorted(known))
 
 
-def parameter_files(config: str, experts: str = "") -> list[str]:
-    """Return the parameter files among the values of `config` and `experts`. InputError for one
-    that does not exist."""
+def list_parameter_files(config: str, experts: str = "") -> list[str]:
+    """Return the parameter files among the values of `config` and `experts`.
+
+    Raises:
+        InputError: a file does not exist.
+    """
     files = [config] if Path(config).is_file() else [f for f in config.split(",") if f]
     if missing := [file for file in files if not Path(file).is_file()]:
-        raise InputError(f"config: there is no parameter file {missing[0]}")
+        raise InputError(f"config: no such parameter file: {missing[0]}")
     if experts and experts not in CONFIGS:
         if not Path(experts).is_file():
-            raise InputError(f"experts: there is no parameter file {experts}, nor a detector of "
-                             f"that name ({', '.join(CONFIGS)})")
+            raise InputError(f"experts: {experts} is neither a parameter file nor a detector "
+                             f"({', '.join(CONFIGS)})")
         files.append(experts)
     return files
 
 
-def started(value: dict[str, str], config_folder: Path) -> list[Node]:
-    """The nodes that the values of the arguments ask for."""
+def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
+    """Return the launch nodes for the values of the arguments."""
     graph, detectors, single = _graph(value), _detectors(value), value["single"] == "true"
-    prefix, users = value["name_prefix"], parameter_files(value["config"])
+    prefix, users = value["name_prefix"], list_parameter_files(value["config"])
     files = {node: [_own_file(name, config_folder), *users] for name in detectors
-             for node in (ALONE if single else BEHIND)[name]}
+             for node in (SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[name]}
     files |= {node: _expert_files(value, config_folder) for node in EXPERTS}
     files |= {node: [str(config_folder / f"{TRACKER}.param.yaml"), *users]
-              for node in trackers_of(detectors)}
-    topics = {relative(POINTS): value["points"], relative(ODOMETRY): value["odometry"]}
+              for node in find_trackers(detectors)}
+    topics = {relative_name(POINTS): value["points"], relative_name(ODOMETRY): value["odometry"]}
     viewer = [_viewer(value, config_folder)] if value["rviz"] == "true" else []
     return viewer + [Node(
-        package="lidar_perception", executable=executable_of(node.removeprefix(prefix)), name=node,
-        namespace=value["namespace"] or None, output="screen",
-        parameters=with_arguments(files[node.removeprefix(prefix)], node,
-                                  _given(value, node.removeprefix(prefix), detectors)),
-        remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_IN}.items()],
+        package="lidar_perception", executable=find_executable(base := node.removeprefix(prefix)),
+        name=node, namespace=value["namespace"] or None, output="screen",
+        parameters=add_arguments(files[base], node, _argument_parameters(value, base, detectors)),
+        # A parameter file may make any node read odometry; for the others the remapping is void.
+        remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_INPUT}.items()],
         ros_arguments=["--log-level", value["log_level"]],
-        respawn=value["respawn"] == "true", respawn_delay=RESPAWN_DELAY,
+        respawn=value["respawn"] == "true", respawn_delay=RESPAWN_DELAY_S,
     ) for node, remap in graph.items()]
 
 
 def _graph(value: dict[str, str]) -> dict[str, dict[str, str]]:
-    # Whether a node wants odometry, its parameter file may say; it changes nothing for the others.
     detectors, single = _detectors(value), value["single"] == "true"
     tracking = value["tracking"] == "true" and not single
-    return prefixed(graph_of(detectors, single, tracking), value["name_prefix"])
+    return add_node_prefix(build_graph(detectors, single, tracking), value["name_prefix"])
 
 
-def with_arguments(files: list[str], node: str, given: dict[str, Any]) -> list[Any]:
-    """Return the parameters of a node for launch: its files, and above them what arguments set."""
-    # launch writes `given` under /**, where rcl prefers the sections that name the node.
+def add_arguments(files: list[str], node: str, given: dict[str, Any]) -> list[Any]:
+    """Return the parameters of a launch node: its files, overridden by the values `given`."""
+    # launch writes `given` under /**, but rcl prefers sections that name the node.
     named = [section for file in files for section in read_sections(file)
              if section != EVERY_NODE and is_for(section, node)]
     if not given or not named:
@@ -205,16 +219,16 @@ def with_arguments(files: list[str], node: str, given: dict[str, Any]) -> list[A
     return [*files, given, file.name]
 
 
-def conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
-    """What to say about the parameter file of ground and clusters: a line for each detector whose
-    own file has other numbers; none where the user chose the file."""
+def describe_conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
+    """Return a line for each detector whose own file has other parameters of ground and clusters
+    than the file in use; none if the user has chosen that file."""
     detectors, given = _detectors(value), value["experts"]
     if value["single"] == "true":
-        return ["experts has no effect, as with single:=true each detector finds ground and "
+        return ["experts has no effect: with single:=true each detector finds ground and "
                 "clusters itself"] if given else []
     if given not in ("", *CONFIGS):
         return []
-    chosen, users = given or detectors[0], parameter_files(value["config"])
+    chosen, users = given or detectors[0], list_parameter_files(value["config"])
     numbers = {name: _expert_numbers([_own_file(name, config_folder), *users])
                for name in (chosen, *detectors)}
     lines = []
@@ -222,9 +236,8 @@ def conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
         others = [f"{key} {number}" for key, number in numbers[name].items()
                   if number != numbers[chosen][key]]
         if others:
-            lines.append(f"ground and clusters are started with the numbers of {chosen}; those of "
-                         f"{name} are others: {', '.join(others)}. experts:=NAME or experts:=FILE "
-                         "chooses")
+            lines.append(f"ground and clusters use the parameters of {chosen}; {name} has other "
+                         f"ones: {', '.join(others)}. Choose with experts:=NAME or experts:=FILE")
     return lines
 
 
@@ -235,7 +248,8 @@ def _own_file(detector: str, config_folder: Path) -> str:
 def _expert_files(value: dict[str, str], config_folder: Path) -> list[str]:
     """Return the parameter files of ground and clusters."""
     chosen = value["experts"] if value["experts"] in CONFIGS else _detectors(value)[0]
-    return [_own_file(chosen, config_folder), *parameter_files(value["config"], value["experts"])]
+    users = list_parameter_files(value["config"], value["experts"])
+    return [_own_file(chosen, config_folder), *users]
 
 
 def _expert_numbers(files: list[str]) -> dict[str, Any]:
@@ -251,15 +265,15 @@ def _expert_numbers(files: list[str]) -> dict[str, Any]:
 def _detectors(value: dict[str, str]) -> list[str]:
     detectors = [name.strip() for name in value["detectors"].split(",") if name.strip()]
     if not detectors:
-        raise InputError(f"detectors is empty; give one or several of {','.join(BEHIND)}")
+        raise InputError(f"detectors is empty; give one or more of {','.join(DETECTOR_NODES)}")
     return detectors
 
 
 def _viewer(value: dict[str, str], config_folder: Path) -> Node:
-    """RViz, its topics renamed as those of the nodes are."""
+    """Return the RViz node, with the same topic names as the other nodes."""
     file = config_folder / "lidar_perception.rviz"
     frame = ["-f", value["rviz_frame"]] if value["rviz_frame"] else []
-    renamed = {topic: _shown(topic, value) for _, topic in rviz_topics(file)}
+    renamed = {topic: _rename_rviz_topic(topic, value) for _, topic in read_rviz_topics(file)}
     return Node(
         package="rviz2", executable="rviz2", name=value["name_prefix"] + "rviz",
         namespace=value["namespace"] or None, arguments=["-d", str(file), *frame], output="screen",
@@ -267,28 +281,29 @@ def _viewer(value: dict[str, str], config_folder: Path) -> Node:
         remappings=[(a, b) for a, b in renamed.items() if a != b])
 
 
-def rviz_topics(file: Path) -> list[tuple[str, str]]:
-    """(class, topic) of each display and tool of an RViz file that has a topic."""
+def read_rviz_topics(file: Path) -> list[tuple[str, str]]:
+    """Return (class, topic) of each display and tool of an RViz file that has a topic."""
     manager = yaml.safe_load(file.read_text())["Visualization Manager"]
-    return [(each["Class"], each["Topic"]["Value"])
-            for each in [*manager["Displays"], *manager["Tools"]] if "Topic" in each]
+    return [(item["Class"], item["Topic"]["Value"])
+            for item in [*manager["Displays"], *manager["Tools"]] if "Topic" in item]
 
 
-def _shown(topic: str, value: dict[str, str]) -> str:
+def _rename_rviz_topic(topic: str, value: dict[str, str]) -> str:
     node, slash, rest = topic.partition("/")
     detectors, single = _detectors(value), value["single"] == "true"
-    if topic == relative(POINTS):
+    if topic == relative_name(POINTS):
         return value["points"]
     if node == TRACKER:  # of the first detector
-        node = next(iter(ALONE[detectors[0]] if single else trackers_of(detectors)))
+        node = next(iter(SINGLE_PROCESS_NODES[detectors[0]] if single
+                         else find_trackers(detectors)))
     elif single and node in STAGES:
         node = next(iter(SINGLE))
-    ours = node in {*graph_of([*BEHIND]), *trackers_of(detectors), *SINGLE}
+    ours = node in {*build_graph([*DETECTOR_NODES]), *find_trackers(detectors), *SINGLE}
     return (value["name_prefix"] if ours else "") + node + slash + rest
 
 
-def _given(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, Any]:
-    """Parameters that arguments set, above those of the file."""
+def _argument_parameters(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, Any]:
+    """Return the parameters of a node that are set by launch arguments."""
     given: dict[str, Any] = {}
     if value["use_sim_time"]:
         given["use_sim_time"] = value["use_sim_time"] == "true"
@@ -318,17 +333,17 @@ def _degrees(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise InputError(f"ahead:={text} is no number of degrees") from None
+        raise InputError(f"ahead:={text} is not a number of degrees") from None
 
 
 def _weights(text: str, networks: list[str]) -> dict[str, str]:
-    """Network -> file, of FILE or NAME=FILE,NAME=FILE."""
+    """Return {network: file}, parsed from FILE or NAME=FILE,NAME=FILE."""
     if not text:
         return {}
     if len(networks) == 1 and not text.startswith(f"{networks[0]}="):
         return {networks[0]: text}
     pairs = dict(part.partition("=")[::2] for part in text.split(","))
     if unknown := [name for name in pairs if name not in networks]:
-        raise InputError(f"weights: '{unknown[0]}' is none of {', '.join(networks)}; with several "
-                         "networks give NAME=FILE,NAME=FILE")
+        raise InputError(f"weights: '{unknown[0]}' is not one of {', '.join(networks)}; with "
+                         "several networks give NAME=FILE,NAME=FILE")
     return pairs

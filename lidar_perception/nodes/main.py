@@ -1,8 +1,8 @@
-"""Start a node: block signals first, then compile, then ROS. Every executable enters here.
+"""Entry point of all node executables: block signals, compile, then start ROS.
 
-A thread that a library starts before the signals are blocked, such as one of NumPy's OpenBLAS,
-never blocks them, and they end the process there. So this module imports the standard library
-only, and each function its own imports.
+Threads that a library starts before the signals are blocked, such as those of OpenBLAS, do not
+block them, and a signal would end the process there. So this module imports only the standard
+library at its top, and the functions import the rest.
 """
 
 from __future__ import annotations
@@ -26,32 +26,35 @@ STOP_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
 
 
 def help_text(name: str) -> str:
-    """What --help prints: how to start the node, and its parameters."""
-    from lidar_perception.nodes.known import node_parameters
+    """Return the text of --help: usage and parameters of a node."""
+    from lidar_perception.nodes.node_parameters import find_node_parameters
     from lidar_perception.param_fields import describe_fields
     lines = [f"Usage: {name} --ros-args [-p PARAMETER:=VALUE] [-r FROM:=TO] [--params-file YAML]",
              "", "Parameters:"]
-    return "\n".join([*lines, *describe_fields(node_parameters(name))])
+    return "\n".join([*lines, *describe_fields(find_node_parameters(name))])
 
 
 def run(name: str, arguments: list[str]) -> int:
-    """Run a node until SIGINT or SIGTERM (exit code 0), or until it is done. 2: it cannot start."""
+    """Run a node until it is done or gets SIGINT or SIGTERM; return its exit code.
+
+    The code is 0 after a signal, and 2 if the node cannot start.
+    """
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     begin = perf_counter()
     from lidar_perception.runs.memory import keep_freed_memory
     from lidar_perception.runs.threads import default_to_one_thread
-    default_to_one_thread()  # or nodes that share few cores stand in each other's way
+    default_to_one_thread()  # nodes share the cores
     keep_freed_memory()
     from lidar_perception.nodes.stopping import Stop
     stop = Stop(STOP_SIGNALS)
     if {"-h", "--help"} & set(arguments[1:]):
         try:
             print(help_text(name), flush=True)
-        except BrokenPipeError:  # `| head`: Python shall not try again at its end
+        except BrokenPipeError:  # `| head`: keep Python from flushing again at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    from lidar_perception.nodes.shared_memory import fed_by_a_driver, use_large_shared_memory
-    use_large_shared_memory(fed_by_a_driver(arguments))
+    from lidar_perception.nodes.shared_memory import is_fed_by_driver, use_large_shared_memory
+    use_large_shared_memory(is_fed_by_driver(arguments))
     from lidar_perception.types import InputError
     try:
         require_rclpy()
@@ -71,9 +74,9 @@ def run(name: str, arguments: list[str]) -> int:
 
 
 def _logger_name(arguments: list[str]) -> str:
-    """Return the name under which ROS logs a node with these arguments, before there is the node.
+    """Return the logger name of a node with these arguments before the node exists.
 
-    The name after remapping, with its namespace; without a rule that of the executable.
+    It is the remapped name of the node, or that of the executable, with the namespace.
     """
     rules = [b.rpartition(":__")[2].removeprefix("__").partition(":=")
              for a, b in pairwise(arguments) if a in ("-r", "--remap")]
@@ -82,19 +85,19 @@ def _logger_name(arguments: list[str]) -> str:
     return ".".join([*filter(None, given.get("ns", "").split("/")), name])
 
 
-def _misspelt_sections(arguments: list[str], node: str) -> list[str]:
-    """Return a line for each section of the parameter files that may be meant for this node."""
-    from lidar_perception.nodes.param_files import unknown_nodes
+def _find_misspelt_sections(arguments: list[str], node: str) -> list[str]:
+    """Return a line for each section of the parameter files whose name is close to this node's."""
+    from lidar_perception.nodes.param_files import describe_unknown_nodes
     from lidar_perception.types import InputError
     lines = []
     for path in [b for a, b in pairwise(arguments) if a == "--params-file"]:
-        with suppress(InputError):  # too large, say; rcl has read it all the same
-            lines += unknown_nodes(path, [node], only_like=True)
+        with suppress(InputError):  # for example too large for us; rcl has read it
+            lines += describe_unknown_nodes(path, [node], only_similar=True)
     return lines
 
 
-def _leave(node: LidarNode) -> None:
-    """End the process beside work that goes on, such as a compilation."""
+def _exit_process(node: LidarNode) -> None:
+    """End the process while its work, such as a compilation, still runs."""
     import rclpy
     with suppress(Exception):
         node.destroy_node()
@@ -103,36 +106,42 @@ def _leave(node: LidarNode) -> None:
 
 
 def _spin(node_class: type, arguments: list[str], begin: float, stop: Stop) -> int:
-    """Make the node and spin it. begin: perf_counter() at the start of the process."""
+    """Create a node and spin it; return the exit code.
+
+    begin is the perf_counter() at the start of the process.
+    """
     import rclpy
     from rclpy.exceptions import NameValidationException, ParameterException
     from rclpy.executors import SingleThreadedExecutor
-    from rclpy.impl.implementation_singleton import rclpy_implementation
     from rclpy.logging import get_logger
     from rclpy.signals import SignalHandlerOptions
 
-    from lidar_perception.nodes.known import misspelt
+    from lidar_perception.nodes.node_parameters import describe_misspelt_parameters
+    from lidar_perception.nodes.rclpy_compat import (
+        RCLError,
+        UnknownROSArgsError,
+        parameter_overrides,
+    )
     from lidar_perception.runs.files import convert_os_errors
     from lidar_perception.types import InputError
 
-    RCLError = rclpy_implementation.RCLError
-    UnknownROSArgsError = rclpy_implementation.UnknownROSArgsError
     log = get_logger(_logger_name(arguments))
     node, code = None, 1
-    kept: BaseException | None = None  # and with it what a refused node has made
+    kept: BaseException | None = None  # keeps the entities of a node that failed to start
     try:
-        stop.react = lambda: None  # DDS has to be taken down from here on: see stop.asked
+        stop.on_signal = lambda: None  # DDS must be shut down from here on, see stop.requested
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         with convert_os_errors():
             node = node_class()
-        stop.react = lambda: node.stop.set_result(None)
+        stop.on_signal = lambda: node.stop.set_result(None)
         if not node.writes_files:
-            stop.leave = lambda: _leave(node)
-        if stop.asked:
+            stop.force_exit = lambda: _exit_process(node)
+        if stop.requested:
             node.stop.set_result(None)
-        for line in [*misspelt(n for n in node._parameter_overrides if not node.has_parameter(n)),
-                     *_misspelt_sections(arguments, node.get_name())]:
-            node.get_logger().warning(line)  # before anything that takes long
+        undeclared = [name for name in parameter_overrides(node) if not node.has_parameter(name)]
+        for line in [*describe_misspelt_parameters(undeclared),
+                     *_find_misspelt_sections(arguments, node.get_name())]:
+            node.get_logger().warning(line)  # before any long work
         if not node.stop.done():
             node.start()
         if not node.stop.done():
@@ -144,23 +153,23 @@ def _spin(node_class: type, arguments: list[str], begin: float, stop: Stop) -> i
             node.spin(executor)
         code = 0
     except UnknownROSArgsError as error:
-        log.fatal(f"unknown after --ros-args: {error}")
+        log.fatal(f"unknown argument after --ros-args: {error}")
         kept, code = error, 2
     except (InputError, ValueError, ParameterException, NameValidationException, RCLError) as error:
         log.fatal(" ".join(str(error).split()))
         kept, code = error, 2
     finally:
-        stop.closing()
+        stop.begin_closing()
         if node is not None:
             try:
                 node.close()
-            except InputError as error:  # what it holds cannot be written
+            except InputError as error:  # its results cannot be written
                 node.get_logger().fatal(str(error))
                 code = code or 1
-        stop.closed(code)
+        stop.finish_closing(code)
         if node is not None:
             node.destroy_node()
-        del kept  # DDS is taken down here, where a hang is cut short
+        del kept  # shuts down DDS here, where the guard ends a hang
         rclpy.try_shutdown()
     return code
 
@@ -169,4 +178,4 @@ if __name__ == "__main__":
     code = run(sys.argv[1], sys.argv[1:])
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(code)  # DDS is down; to unload torch, too, would take two seconds on busy cores
+    os._exit(code)  # DDS is down; unloading torch would take seconds

@@ -1,4 +1,4 @@
-"""Managed nodes: a lifecycle manager, such as Nav2's, configures, activates and ends them."""
+"""Base class of lifecycle nodes, which a lifecycle manager such as that of Nav2 can drive."""
 
 from __future__ import annotations
 
@@ -13,6 +13,13 @@ from typing import Any, ClassVar
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 
+from lidar_perception.nodes.rclpy_compat import (
+    allowed_transitions,
+    clock_subscription,
+    destroy_state_machine,
+    state_label,
+    wrap_change_state,
+)
 from lidar_perception.nodes.runtime import ERROR, OK, WAITING, WARN, LidarNode
 from lidar_perception.nodes.transforms import Transforms
 from lidar_perception.runs.compiling import report_compilation
@@ -20,9 +27,9 @@ from lidar_perception.runs.files import convert_os_errors
 from lidar_perception.types import InputError
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
-RETRY_PERIOD = 5.0  # seconds at least, and RETRY_SHARE times as long as an attempt takes
-RETRY_SHARE = 10.0
-UNASKED = 10.0  # seconds after its start, in which a lifecycle manager asks a node for something
+MIN_RETRY_PERIOD_S = 5.0
+RETRY_FACTOR = 10.0  # retry period over the duration of an attempt
+MANAGER_TIMEOUT_S = 10.0  # after the start, for the first request of a lifecycle manager
 UNCONFIGURED, INACTIVE = "not configured", "not active"
 ENTITIES: dict[str, Any] = {
     "publishers": Node.destroy_publisher, "subscriptions": Node.destroy_subscription,
@@ -31,33 +38,35 @@ ENTITIES: dict[str, Any] = {
 
 
 class ManagedNode(LifecycleNodeMixin, LidarNode):
-    """A LidarNode with the states of a managed node
-    (https://design.ros2.org/articles/node_lifecycle.html).
+    """A LidarNode with the states of a managed node.
 
-    A node says in configure() what it needs, and knows nothing else of its states: its inputs are
-    subscribed to while it is active, and a cleanup forgets every attribute that configure() has
-    set and destroys every publisher, timer and so on that it has made, so that the memory of a
-    network is free again. With the parameter autostart the node goes to active by itself, and
-    where that fails tries again, as a file that is missing may appear. Without it a node that
-    nobody asks for anything, as of a manager that has not seen it start again, says so.
+    See https://design.ros2.org/articles/node_lifecycle.html. A subclass only implements
+    configure(). Its inputs are subscribed to while the node is active. A cleanup deletes every
+    attribute that configure() has set and destroys every publisher, timer and so on that it has
+    made, which frees the memory of a network. With the parameter autostart the node activates
+    itself and retries after a failure, as a missing file may appear. Without it, the node warns if
+    no lifecycle manager has requested anything, for example after a restart.
     """
 
-    waits_for: ClassVar[tuple[str, ...]] = ("points",)  # the ~/input/... that its work comes from
+    waits_for: ClassVar[tuple[str, ...]] = ("points",)  # inputs below ~/input
 
-    def __init__(self, name: str, params: Any, robot: Any, **options: Any):
-        LidarNode.__init__(self, name, params, robot, **options)
+    def __init__(self, name: str, params: Any, node_params: Any, **options: Any):
+        LidarNode.__init__(self, name, params, node_params, **options)
         LifecycleNodeMixin.__init__(self)
         self.active = False
         self.state = (OK, UNCONFIGURED)
         self._retry_at: float | None = None
-        self._unasked_since: float | None = None  # monotonic; None once it was asked
-        self._own: set[str] = set()  # attributes that a cleanup leaves
-        self._kept: list[Any] = []  # publishers and so on, likewise
-        change = self._service_change_state.callback
-        self._service_change_state.callback = lambda *call: self._change(change, *call)
+        self._unmanaged_since: float | None = None  # monotonic; None after a request
+        self._own_attributes: set[str] = set()  # kept by a cleanup
+        self._own_entities: list[Any] = []  # publishers and so on, kept by a cleanup
+        wrap_change_state(self, self._change)
 
     def configure(self) -> None:
-        """Make outputs and inputs, and load what is needed. InputError if it is not to be had."""
+        """Make outputs and inputs, and load networks.
+
+        Raises:
+            InputError: a file is missing or unusable.
+        """
         raise NotImplementedError
 
     def _configure(self) -> None:
@@ -69,10 +78,10 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         return self.state_label() == "active"
 
     def start(self) -> None:
-        if not self.robot.autostart:
-            self.get_logger().info(f"{UNCONFIGURED}: waits for a lifecycle manager, as autostart "
-                                   "is false")
-            self._unasked_since = monotonic()
+        if not self.node_params.autostart:
+            self.get_logger().info(f"{UNCONFIGURED}: waiting for a lifecycle manager, because "
+                                   "autostart is false")
+            self._unmanaged_since = monotonic()
             return
         begin = monotonic()
         if (self.state_label() == "inactive" or self.trigger_configure() == SUCCESS) and (
@@ -82,62 +91,60 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
             self._retry_at = None
         else:
             now = monotonic()
-            self._retry_at = now + max(RETRY_PERIOD, RETRY_SHARE * (now - begin))
+            self._retry_at = now + max(MIN_RETRY_PERIOD_S, RETRY_FACTOR * (now - begin))
 
     def _tick(self) -> None:
         if self._retry_at is not None and monotonic() > self._retry_at:
             self.start()
-        if self._unasked_since is not None and monotonic() - self._unasked_since > UNASKED:
-            self.report(*self._unasked())
+        since = self._unmanaged_since
+        if since is not None and monotonic() - since > MANAGER_TIMEOUT_S:
+            self.report(*self._describe_unmanaged())
         super()._tick()
 
-    def _unasked(self) -> tuple[bytes, str]:
-        """The state of a node that was never asked for a transition."""
+    def _describe_unmanaged(self) -> tuple[bytes, str]:
+        """Return the diagnostic of a node that has had no transition request."""
         topics = [self.resolve_topic_name(f"~/input/{name}") for name in self.waits_for]
-        if not (sent := [topic for topic in topics if self.count_publishers(topic)]):
+        if not (published := [topic for topic in topics if self.count_publishers(topic)]):
             return OK, UNCONFIGURED
         name = self.get_fully_qualified_name()
-        return WARN, (f"{UNCONFIGURED}, and nobody has asked for it, but there is a publisher on "
-                      f"{sent[0]}: a lifecycle manager does not see that a node was started again; "
-                      f"let it begin anew, or `ros2 lifecycle set {name} configure`, then activate")
+        return WARN, (f"{UNCONFIGURED} by any lifecycle manager, but there is a publisher on "
+                      f"{published[0]}: a manager does not notice that a node was restarted; "
+                      f"restart the manager, or run `ros2 lifecycle set {name} configure`, then "
+                      "activate")
 
     def _change(self, change: Callable, request: Any, response: Any) -> Any:
-        """A change that the present state does not allow is refused; rclpy would end the node."""
-        possible = [key for number, label, *_ in self._state_machine.available_transitions
-                    for key in (number, label)]
-        wanted = request.transition.label or request.transition.id
-        if wanted in possible:
+        """Refuse a transition that the present state does not allow; rclpy would end the node."""
+        transition = request.transition.label or request.transition.id
+        if transition in allowed_transitions(self):
             self._retry_at = None
             return change(request, response)
         self.get_logger().error(
-            f"transition {wanted} is asked for, but the node is {self.state_label()}" + (
-                "; a node that a lifecycle manager is to drive needs the parameter autostart false"
-                if self.robot.autostart else ""))
+            f"transition {transition} is not possible: the node is {self.state_label()}" + (
+                "; set the parameter autostart to false for use with a lifecycle manager"
+                if self.node_params.autostart else ""))
         response.success = False
         return response
 
     def destroy_node(self) -> None:
-        """With the state machine, which rclpy leaves, and with it the node in the graph, until it
-        is collected as garbage."""
         super().destroy_node()
-        self._state_machine.destroy_when_not_in_use()
+        destroy_state_machine(self)
 
     def state_label(self) -> str:
-        """unconfigured, inactive, active or finalized; configuring and so on in between."""
-        return self._state_machine.current_state[1]
+        """Return the lifecycle state, such as "inactive", or "configuring" in a transition."""
+        return state_label(self)
 
     def publish_diagnostics(self) -> None:
         self.counts["lifecycle"] = self.state_label()
         super().publish_diagnostics()
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._unasked_since = None
-        self._own = set(vars(self))
-        self._kept = [entity for kind in ENTITIES for entity in getattr(self, kind)]
+        self._unmanaged_since = None
+        self._own_attributes = set(vars(self))
+        self._own_entities = [entity for kind in ENTITIES for entity in getattr(self, kind)]
         if self._retry_at is None:
             self.report(WARN, "configuring", expected=True)
         before = self.state
-        if problem := self._problem_of(self._configure):
+        if problem := self._find_problem(self._configure):
             self._forget_configuration()
             self.report(ERROR, f"{UNCONFIGURED}, so this node publishes nothing: {problem}")
             return FAILURE
@@ -147,7 +154,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self.active = True
-        if problem := self._problem_of(lambda: [made.open() for made in self.inputs]):
+        if problem := self._find_problem(lambda: [source.open() for source in self.inputs]):
             self._deactivate()
             self.report(ERROR, f"{INACTIVE}: {problem}")
             return FAILURE
@@ -166,7 +173,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         return SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._unasked_since = None
+        self._unmanaged_since = None
         if self.active:
             self._deactivate()
         if self.inputs:
@@ -174,14 +181,14 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         self.report(OK, "shut down; the process ends at SIGINT or SIGTERM")
         return SUCCESS
 
-    def _problem_of(self, step: Callable[[], Any]) -> str | None:
-        """What step() fails for; what is no InputError is logged in full, once."""
+    def _find_problem(self, step: Callable[[], Any]) -> str | None:
+        """Run step() and return its error message; log the traceback of unexpected errors once."""
         try:
             with convert_os_errors():
                 step()
         except InputError as error:
             return str(error)
-        except Exception as error:  # of torch and its drivers, say: the node lives to tell
+        except Exception as error:  # of torch or its drivers, for example
             problem = f"{type(error).__name__}: {error}"
             if not self.state[1].endswith(problem):
                 self.get_logger().error(traceback.format_exc())
@@ -190,23 +197,22 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
 
     def _deactivate(self) -> None:
         self.active = False
-        for made in self.inputs:
-            made.close()
+        for source in self.inputs:
+            source.close()
 
     def _forget_configuration(self) -> None:
-        for name in set(vars(self)) - self._own:
+        for name in set(vars(self)) - self._own_attributes:
             delattr(self, name)
-        self.forget()
-        # rclpy's own of /clock, which it makes whenever use_sim_time is set
-        kept = [*self._kept, self._time_source._clock_sub]
+        self.reset_state()
+        kept = [*self._own_entities, clock_subscription(self)]
         for kind, destroy in ENTITIES.items():
             for entity in [e for e in getattr(self, kind) if e not in kept]:
                 destroy(self, entity)
-        give_back_memory()
+        release_memory()
 
 
-def give_back_memory() -> None:
-    """What Python, torch and the C library have free, to the operating system and to CUDA."""
+def release_memory() -> None:
+    """Return free memory of Python, torch and the C library to the operating system and to CUDA."""
     gc.collect()
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized():

@@ -1,4 +1,4 @@
-"""Publishing what was found in a frame, shared by the nodes that find objects."""
+"""Publishers of detections, clusters and obstacles, shared by several nodes."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from lidar_perception.nodes.runtime import CLOUD, MARKERS, OK, RELIABLE, WARN, L
 from lidar_perception.nodes.track_outputs import (
     DETECTIONS_3D,
     TrackOutputs,
+    find_marker_lifetime_ns,
     has_detections_3d,
-    lifetime_ns,
 )
 from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
@@ -29,9 +29,12 @@ from msg_utils.messages import message_class, ros_message
 from msg_utils.stamps import header_message, to_ns
 
 
-def placed(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[Any, np.ndarray]:
-    """header and boxes (K, 7), found in the levelled frame of a cloud with this header, in the
-    frame that the results go out in; float64 there, as a map may be far from its origin."""
+def to_output_frame(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[Any, np.ndarray]:
+    """Transform boxes (K, 7) from the level frame of a cloud to the output frame.
+
+    Returns:
+        Header in the output frame, and boxes; float64, as a map may be far from its origin.
+    """
     placing = node.transforms.placing(header)
     if placing.frame_id != header.frame_id:
         header = header_message(to_ns(header.stamp), placing.frame_id, bag_message)
@@ -39,47 +42,54 @@ def placed(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[Any, np.nda
 
 
 class ClusterBoxes:
-    """~/output/boxes, made only while somebody subscribes."""
+    """~/output/boxes, computed only while there are subscribers."""
 
     def __init__(self, node: LidarNode):
         self.node = node
         self.publisher = node.output("boxes", MARKERS)
-        self.shown: Any = ()
+        self.marker_keys: Any = ()
 
     def publish(self, header: Any, boxes: Callable[[], np.ndarray]) -> None:
         if self.publisher.get_subscription_count():
-            header, found = placed(self.node, header, boxes())
-            ids = range(1, len(found) + 1)  # as in the column cluster_id
-            markers = to_marker_array(found, ["cluster"] * len(found), header=header,
-                                      make=bag_message, ids=ids, previous=self.shown,
-                                      lifetime_ns=lifetime_ns(self.node),
-                                      extras=_texts(found, ids))
-            self.shown = marker_keys(markers)
+            header, output = to_output_frame(self.node, header, boxes())
+            ids = range(1, len(output) + 1)  # as in the column cluster_id
+            markers = to_marker_array(output, ["cluster"] * len(output), header=header,
+                                      make=bag_message, ids=ids, previous=self.marker_keys,
+                                      lifetime_ns=find_marker_lifetime_ns(self.node),
+                                      extras=_marker_texts(output, ids))
+            self.marker_keys = marker_keys(markers)
             self.publisher.publish(encode(markers))
 
 
-def _texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
-    """For the text of each box's marker: its id, and what it could be by its length and width
-    alone."""
+def _marker_texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
+    """Return the text of each marker: the id, and the class by length and width alone."""
     return [{"id": i, **({"size_class": CLASSES[c]} if c >= 0 else {})}
             for i, c in zip(ids, classify_by_diagonal(boxes), strict=True)]
 
 
 class Obstacles:
-    """~/output/obstacles for a costmap, made only while somebody subscribes: x y z, and intensity
-    where the cloud has one, of what is no ground and in the height band of the parameters. node
-    has the groups robot.obstacles and params.ground."""
+    """~/output/obstacles for a costmap, computed only while there are subscribers.
+
+    The points outside the ground in the height band of the parameters, with x y z and, if the cloud
+    has it, intensity. The node has the groups node_params.obstacles and params.ground.
+    """
 
     def __init__(self, node: LidarNode):
         self.node, self.publisher = node, node.output("obstacles", CLOUD)
 
     def publish(self, msg: Any, xyz: np.ndarray, ground: np.ndarray, indices: np.ndarray) -> None:
-        """Of levelled points (M, 3) that are ground (M,) or not, at indices (M,) in the cloud
-        msg, in whose frame they are published."""
+        """Publish the obstacles of a cloud in the frame of the cloud.
+
+        Args:
+            msg: the cloud.
+            xyz: (M, 3) levelled points.
+            ground: (M,) bool.
+            indices: (M,) indices of the points in the cloud.
+        """
         if self.publisher.get_subscription_count():
             placing = self.node.transforms.placing(msg.header)
-            params = self.node.transforms.mounted(self.node.params, placing)
-            chosen = find_obstacles(xyz, ground, self.node.robot.obstacles,
+            params = self.node.transforms.with_mounting(self.node.params, placing)
+            chosen = find_obstacles(xyz, ground, self.node.node_params.obstacles,
                                     params.ground.sensor_pose)
             self.publisher.publish(encode(make_xyz_cloud(
                 msg, placing.to_cloud_frame(xyz.compress(chosen, axis=0)), indices.compress(chosen),
@@ -87,24 +97,24 @@ class Obstacles:
 
 
 class DetectionMarkers:
-    """A topic with detections as markers."""
+    """Publisher of detections as markers."""
 
     def __init__(self, node: LidarNode, topic: str):
         self.node, self.publisher = node, node.output(topic, MARKERS)
-        self.shown: Any = ()
+        self.marker_keys: Any = ()
 
     def publish(self, header: Any, detections: Detections,
                 clusters: np.ndarray | None = None) -> None:
-        """In the frame of header, as they are."""
-        message = make_detection_markers(detections, header, bag_message, self.shown,
-                                         lifetime_ns(self.node), clusters)
-        self.shown = marker_keys(message)
+        """Publish detections that are in the frame of the header."""
+        message = make_detection_markers(detections, header, bag_message, self.marker_keys,
+                                         find_marker_lifetime_ns(self.node), clusters)
+        self.marker_keys = marker_keys(message)
         self.publisher.publish(encode(message))
 
 
 class DetectionOutputs:
-    """~/output/detections (and ~/output/detections_3d where vision_msgs is installed), the time
-    of each step, and with the parameter tracking.enabled the tracks."""
+    """~/output/detections, detections_3d if vision_msgs is installed, the time of each step, and
+    with the parameter tracking.enabled the tracks."""
 
     def __init__(self, node: LidarNode, steps: tuple[str, ...]):
         self.node = node
@@ -115,18 +125,27 @@ class DetectionOutputs:
                 message_class(DETECTIONS_3D), "~/output/detections_3d", RELIABLE)
         self.step_times = {step: node.create_publisher(Float64, f"~/debug/{step}_ms", RELIABLE)
                            for step in steps}
-        self.tracks = (TrackOutputs(node, lambda: node.robot, clouds=True)
-                       if node.robot.tracking.enabled else None)
+        self.tracks = (TrackOutputs(node, lambda: node.node_params, clouds=True)
+                       if node.node_params.tracking.enabled else None)
 
     def publish(self, header: Any, detections: Detections, ms: Mapping[str, float],
                 xyz: np.ndarray, *, weak: Detections | None = None,
                 clusters: np.ndarray | None = None) -> str | None:
-        """Publish detections of the scan xyz (N, 3), with the cluster_id of each where it is known,
-        the times of the steps that are known, and where there is a tracker the tracks; it is given
-        `weak`, with those below the thresholds too, if there are any. All are of the levelled
-        cloud; tracks are in the cloud's frame. Returns what was wrong for the tracker."""
-        cloud, found = header, detections if weak is None else weak
-        header, boxes = placed(self.node, header, detections.boxes)
+        """Publish the detections of a levelled cloud, and their tracks in the frame of the cloud.
+
+        Args:
+            header: header of the cloud.
+            detections: detections above the thresholds.
+            ms: {step: its time in ms}.
+            xyz: (N, 3) levelled points, for the tracker.
+            weak: all detections for the tracker, also those below the thresholds.
+            clusters: (K,) cluster_id of each detection.
+
+        Returns:
+            The problem of the tracker with its remedy, or None.
+        """
+        cloud_header, tracked = header, detections if weak is None else weak
+        header, boxes = to_output_frame(self.node, header, detections.boxes)
         detections = replace(detections, boxes=boxes)
         self.markers.publish(header, detections, clusters)
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
@@ -139,15 +158,15 @@ class DetectionOutputs:
                 publisher.publish(Float64(data=ms[step]))
         if self.tracks is None:
             return None
-        placing = self.node.transforms.placing(cloud)
+        placing = self.node.transforms.placing(cloud_header)
         if placing.level is not None:
-            found = replace(found, boxes=transform_boxes(found.boxes, invert_pose(placing.level)))
-        return self.tracks.publish(cloud, found, placing.to_cloud_frame(xyz))
+            tracked = replace(
+                tracked, boxes=transform_boxes(tracked.boxes, invert_pose(placing.level)))
+        return self.tracks.publish(cloud_header, tracked, placing.to_cloud_frame(xyz))
 
 
 class CandidateOutputs:
-    """The candidates as detections, and the earlier stages under ~/debug/stage1 and
-    ~/debug/stage2."""
+    """The candidates as detections, and the earlier stages on ~/debug/stage1 and stage2."""
 
     def __init__(self, node: LidarNode, steps: tuple[str, ...] = ("height", "stm", "cpa")):
         self.node = node
@@ -157,20 +176,26 @@ class CandidateOutputs:
 
     def publish(self, header: Any, xyz: np.ndarray, find: Callable[[], Candidates],
                 problem: str | None = None) -> None:
-        """Publish what find() gives for the scan xyz (N, 3); where it raises InputError, no
-        candidates and the reason. problem is what is known to be wrong with the frame already."""
+        """Publish the candidates of find().
+
+        Args:
+            header: header of the cloud.
+            xyz: (N, 3) levelled points.
+            find: returns the candidates; after an InputError none are published.
+            problem: a known problem of the frame, for the diagnostics.
+        """
         try:
             candidates = find()
         except InputError as error:
             candidates, problem = Candidates.none(), problem or str(error)
         for stage, markers in self.stages.items():
             if markers.publisher.get_subscription_count():
-                found = getattr(candidates, stage)
-                place, boxes = placed(self.node, header, found.boxes)
-                markers.publish(place, replace(found, boxes=boxes))
-        untracked = self.final.publish(header, candidates.final, candidates.ms, xyz,
+                detections = getattr(candidates, stage)
+                output_header, boxes = to_output_frame(self.node, header, detections.boxes)
+                markers.publish(output_header, replace(detections, boxes=boxes))
+        tracking_problem = self.final.publish(header, candidates.final, candidates.ms, xyz,
                                        clusters=candidates.clusters)
-        self._diagnose(candidates, problem or untracked)
+        self._diagnose(candidates, problem or tracking_problem)
 
     def _diagnose(self, candidates: Candidates, problem: str | None) -> None:
         self.node.counts["candidates"] = len(candidates.final)

@@ -1,4 +1,4 @@
-"""ROS parameter files: which nodes their sections are for."""
+"""Reading of ROS parameter files, and matching of their sections to nodes."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from lidar_perception.runs.files import read_text, shorten_error
 from lidar_perception.types import InputError, closest_name
 
 MAX_BYTES = 10**6
-MAX_KEYS = 10_000  # that are visited: anchors can put a group into itself
-MAX_LINES = 20     # about names, of one file
+MAX_KEYS = 10_000  # as YAML anchors can nest a group in itself
+MAX_LINES = 20     # of messages for one file
 EVERY_NODE = "/**"
 
 
@@ -37,11 +37,11 @@ def read_sections(path: str | Path) -> dict[str, dict[str, Any]]:
     if not isinstance(content, dict):
         raise InputError(f"{path} is not a parameter file; see config/ for the form")
     visited = count()
-    found: dict[str, dict[str, Any]] = {}
+    sections: dict[str, dict[str, Any]] = {}
     for node, group in _leaves(path, content, visited, "/", stop="ros__parameters"):
         values = group if isinstance(group, dict) else {}
-        found[node] = {**found.get(node, {}), **dict(_leaves(path, values, visited, "."))}
-    return found
+        sections[node] = {**sections.get(node, {}), **dict(_leaves(path, values, visited, "."))}
+    return sections
 
 
 def _leaves(path: str | Path, group: dict, visited: Iterator[int], separator: str,
@@ -63,15 +63,16 @@ def is_for(section: str, node: str) -> bool:
     return section.rpartition("/")[2] in ("*", "**", node)
 
 
-def unknown_nodes(path: str | Path, nodes: Collection[str], only_like: bool = False) -> list[str]:
-    """Return a line for each section of a parameter file that no node takes.
+def describe_unknown_nodes(path: str | Path, nodes: Collection[str],
+                           only_similar: bool = False) -> list[str]:
+    """Return a line for each section of a parameter file that applies to no node.
 
-    It may be for a node of another package. Nodes of ours are known that are not among `nodes`,
-    also with a prefix, since several graphs may share a file.
+    Sections for other nodes of this package, also with a prefix, are accepted, as several graphs
+    may share a file.
 
     Args:
-        nodes: names of the nodes that are started with it.
-        only_like: leave out the names that are not most like one of `nodes`.
+        nodes: names of the nodes that are started with the file.
+        only_similar: only report names whose closest match is one of `nodes`.
     """
     lines = []
     for section in read_sections(path):
@@ -79,7 +80,7 @@ def unknown_nodes(path: str | Path, nodes: Collection[str], only_like: bool = Fa
         if any(is_for(section, node) for node in nodes) or name.endswith(tuple(NODES)):
             continue
         guess = closest_name(name, [*nodes, *NODES])
-        if guess in nodes or not only_like:
+        if guess in nodes or not only_similar:
             lines.append(f"{path}: no node here is called {name[:80]!r}, so its parameters change "
                          "nothing" + (f"; did you mean {guess!r}?" if guess else ""))
     return [*islice(lines, MAX_LINES)]

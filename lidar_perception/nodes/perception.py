@@ -1,4 +1,4 @@
-"""The whole pipeline in one process: ~/input/points -> ~/output/detections."""
+"""Node that finds pedestrian candidates in one process: ~/input/points -> ~/output/detections."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ __all__ = ["Perception", "warm_up"]
 
 
 class Perception(ManagedNode):
-    """Same stages, parameters and results as the graph of single nodes, without the copies
-    between them. ~/output/points, boxes and obstacles are made only while somebody subscribes."""
+    """Has the stages, parameters and results of the graph of single nodes, without copies between
+    them. ~/output/points, boxes and obstacles are computed only while there are subscribers."""
 
     def __init__(self, **options: Any):
         super().__init__("perception", PipelineParams(), PerceptionRobotParams(), **options)
@@ -38,14 +38,14 @@ class Perception(ManagedNode):
         self.boxes = ClusterBoxes(self)
         self.obstacles = Obstacles(self)
         self.seed = SeedInput(self, self.on_cloud)
-        self.input("points", CLOUD, self.seed.add_cloud, needs=self.camera.missing)
+        self.input("points", CLOUD, self.seed.add_cloud, needs=self.camera.find_missing_input)
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, usable, params = self.sensor.frame(msg)
+            frame, usable, params = self.sensor.read_frame(msg)
             segmented = segment_cloud(frame, self.camera.get(msg.header, params.view), params)
             problem = (explain_nothing(len(frame), segmented.ground, segmented.cluster_ids)
-                       or self.sensor.problem(frame, params))
+                       or self.sensor.find_problem(frame, params))
             self.outputs.publish(msg.header, frame.xyz,
                                  lambda: refine_segmented(segmented, source, params), problem)
         indices = usable.take(segmented.indices)

@@ -1,4 +1,4 @@
-"""~/input/points -> ~/output/detections: cars, pedestrians and cyclists among clusters."""
+"""Node of the PointNet detector: ~/input/points -> ~/output/detections."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class PointNetNode(DetectorNode):
-    """Reads the column `cluster_id`; without it the node finds ground and clusters itself."""
+    """Uses the column `cluster_id`; without it the node finds ground and clusters itself."""
 
     group = "pointnet"
     steps = STEPS
@@ -32,5 +32,5 @@ class PointNetNode(DetectorNode):
         from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
         return load_pointnet_detector(weights, device, self.params)
 
-    def name_of(self, config: PointNetConfig) -> str:
+    def describe_network(self, config: PointNetConfig) -> str:
         return config.name

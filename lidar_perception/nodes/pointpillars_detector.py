@@ -1,4 +1,4 @@
-"""~/input/points -> ~/output/detections: cars, pedestrians and cyclists by EG-PointPillars."""
+"""Node of the EG-PointPillars detector: ~/input/points -> ~/output/detections."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class PointPillarsNode(DetectorNode):
-    """Reads the columns of its experts where the cloud has them."""
+    """Uses the columns `ground` and `cluster_id` if the cloud has them."""
 
     group = "pointpillars"
     steps = STEPS
@@ -32,5 +32,5 @@ class PointPillarsNode(DetectorNode):
         from lidar_perception.detectors.pointpillars.detector import load_detector
         return load_detector(weights, device, self.params)
 
-    def name_of(self, config: NetworkConfig) -> str:
+    def describe_network(self, config: NetworkConfig) -> str:
         return f"{config.version} {config.size}"

@@ -1,4 +1,4 @@
-"""How clouds come in: as reliably as they are offered, newest first, every one accounted for."""
+"""Subscriptions to clouds that adapt to the publishers' QoS and count every cloud."""
 
 from __future__ import annotations
 
@@ -15,20 +15,22 @@ from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from lidar_perception.nodes.shared_memory import SOCKET_BUFFER, socket_buffer
+from lidar_perception.nodes.rclpy_compat import parameter_overrides, take_messages
+from lidar_perception.nodes.shared_memory import SOCKET_BUFFER, read_socket_buffer_size
 from lidar_perception.params import ReceptionParams
 
 WARN, ERROR, STALE = DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 DEPTH = 5
-SHARE_OF = 100        # clouds sent, of which the lost and the dropped are counted
-LEARNED_FROM = 20     # intervals between clouds; their median is what is expected
-HELD = 1.0            # seconds for which a newer cloud does not take the place of one that waits
-TRY_AGAIN = 5.0       # seconds between trials where waiting was in vain,
-TRIAL = 0.3           # and how long one takes
-RATE_OF = 10          # intervals, of which the present rate is the mean
-SILENT, STALLED = 3.0, 6.0  # periods without a cloud that are no ERROR, or not STALE, yet
-# Kind of publisher -> what to ask when nothing comes, and when too little does.
+WINDOW = 100            # sent clouds, for the shares of lost and dropped ones
+RATE_SAMPLES = 20       # intervals between clouds, whose median is the expected one
+RATE_INTERVALS = 10     # intervals, whose mean gives the present rate
+MAX_HOLD_S = 1.0        # for which newer clouds do not replace a waiting one
+RETRY_PERIOD_S = 5.0    # between attempts to wait again after waiting has timed out
+RETRY_DURATION_S = 0.3  # of such an attempt
+# Periods without a cloud before the state is ERROR and STALE, respectively.
+SILENT_PERIODS, STALE_PERIODS = 3.0, 6.0
+# Kind of publisher -> what to check when no clouds arrive, and when too few do.
 QUESTIONS = {
     "sensor": ("is the sensor{} running, and connected?", "is the sensor{} overloaded?"),
     "detector": ("is the detector{} running, and does it get clouds?",
@@ -38,29 +40,34 @@ QUESTIONS = {
     "player": ("has the player{} reached the end of its bag, or is it paused?",
                "does the player{} play more slowly?"),
 }
-PROFILE = files("lidar_perception.nodes") / "fastdds.xml"
+FASTDDS_PROFILE = files("lidar_perception.nodes") / "fastdds.xml"
 
 Problem = tuple[str, bytes, str]  # kind, level, message
 
 
 class Arrivals:
-    """What became of the clouds that were sent: sent = taken + dropped + lost.
+    """Count received, dropped and lost clouds (sent = received + dropped + lost).
 
-    Publishers number their messages (publication_sequence_number). A gap is what was lost on the
-    way, or, where the queue was full, what a newer cloud has pushed out of it.
+    Publishers number their messages (publication_sequence_number). A gap counts as lost on the way
+    or, if the queue was full, as dropped from the queue.
     """
 
     def __init__(self, depth: int = DEPTH):
         self.depth = depth
         self.sent = self.dropped = self.lost = 0
-        self.sequence: int | None = None  # of the last cloud
-        self.window: deque[tuple[int, int, int]] = deque([(0, 0, 0)], SHARE_OF + 1)
-        self.stamps: deque[tuple[int, int]] = deque(maxlen=LEARNED_FROM + 1)  # sent, ns
-        self.learned: float | None = None  # Hz
+        self.sequence: int | None = None  # number of the last cloud
+        self.window: deque[tuple[int, int, int]] = deque([(0, 0, 0)], WINDOW + 1)
+        self.stamps: deque[tuple[int, int]] = deque(maxlen=RATE_SAMPLES + 1)  # sent, ns
+        self.learned: float | None = None  # expected rate, Hz
 
     def add(self, infos: list[dict], dropped: int, one_publisher: bool = True) -> None:
-        """Messages that were waiting together, oldest first; dropped is how many were not taken
-        for that. Numbers of more than one publisher tell nothing."""
+        """Count messages.
+
+        Args:
+            infos: message infos of rclpy, of all messages that were waiting, oldest first.
+            dropped: how many of them are not processed.
+            one_publisher: False with several publishers, whose numbers cannot be compared.
+        """
         full = len(infos) >= self.depth
         for i, info in enumerate(infos):
             number, gap = info["publication_sequence_number"], 0
@@ -75,69 +82,75 @@ class Arrivals:
             self.stamps.append((self.sent, info["source_timestamp"]))
         self.dropped += dropped
         self.window.append((self.sent, self.lost, self.dropped))
-        if self.learned is None and len(self.stamps) > LEARNED_FROM:
+        if self.learned is None and len(self.stamps) > RATE_SAMPLES:
             intervals = np.diff(np.array(self.stamps, float), axis=0)
             period = np.median(intervals[:, 1] / intervals[:, 0])
             self.learned = 1e9 / period if period > 0 else None
 
-    def interrupted(self, dropped: int) -> None:
-        """Nothing is taken for a while; dropped is how many were waiting."""
+    def record_interruption(self, dropped: int) -> None:
+        """Count the waiting clouds as dropped, and ignore the clouds until the next one."""
         self.dropped += dropped
         self.sequence = None
         self.stamps.clear()
-        self.begin_anew()
+        self.reset_window()
 
-    def begin_anew(self) -> None:
-        """What was dropped so far had a reason that is over: recent() begins here."""
+    def reset_window(self) -> None:
+        """Restart the window of count_recent(), because the cause of earlier drops is over."""
         self.window.clear()
         self.window.append((self.sent, self.lost, self.dropped))
 
-    def recent(self) -> tuple[int, int, int]:
-        """Of the last SHARE_OF sent, or of more where one gap was longer: how many that are, how
-        many were lost, how many dropped."""
+    def count_recent(self) -> tuple[int, int, int]:
+        """Return (sent, lost, dropped) of the last WINDOW sent clouds, or more after a long gap."""
         now = self.window[-1]
-        before = next((w for w in reversed(self.window) if now[0] - w[0] >= SHARE_OF),
+        before = next((w for w in reversed(self.window) if now[0] - w[0] >= WINDOW),
                       self.window[0])
         sent, lost, dropped = (a - b for a, b in zip(now, before))
         return sent, lost, dropped
 
-    def rate(self) -> float | None:
-        """Clouds a second that are sent now; None while too few have come."""
-        if len(self.stamps) <= RATE_OF:
+    def measure_rate(self) -> float | None:
+        """Return the present rate of sent clouds in Hz, or None while too few have arrived."""
+        if len(self.stamps) <= RATE_INTERVALS:
             return None
-        (n0, t0), (n1, t1) = self.stamps[-1 - RATE_OF], self.stamps[-1]
+        (n0, t0), (n1, t1) = self.stamps[-1 - RATE_INTERVALS], self.stamps[-1]
         return 1e9 * (n1 - n0) / (t1 - t0) if t1 > t0 else None
 
 
 class Reception:
-    """A subscription of clouds, or of arrays made of them. deliver gets the newest ones that are
-    waiting (as many as the parameter input.queue says), as bytes, one at a time, and says what the
-    cloud still needs, or None. While it is patient (up to input.max_wait seconds) it does not work
-    on a cloud that needs something, and gets it again at try_again().
+    """A subscription to clouds, or to arrays made from clouds.
 
-    It is RELIABLE where all publishers offer that, as of an ordinary driver's 2 MB a best-effort
-    subscriber gets less than half; a BEST_EFFORT publisher, also one that comes later, makes it
-    BEST_EFFORT, as else nothing at all would come from it. qos_overrides stand above that.
+    It is RELIABLE if all publishers offer that, because a best-effort subscriber receives less than
+    half of the 2 MB clouds of an ordinary driver. A BEST_EFFORT publisher, also a later one, makes
+    it BEST_EFFORT, as its clouds would not arrive otherwise. qos_overrides take precedence.
+
+    Args:
+        node: the node that subscribes.
+        kind: class of the message.
+        name: name of the topic.
+        deliver: called with the bytes of each of the newest input.queue clouds, and with whether
+            the cloud may wait. Returns what the cloud still needs, or None. A cloud that may wait
+            (up to input.max_wait seconds) and needs something is delivered again at retry().
+        params: returns the present parameters of the group input.
+        what: name of one message in diagnostics.
     """
 
     def __init__(self, node: Node, kind: type, name: str,
                  deliver: Callable[[bytes, bool], str | None],
                  params: Callable[[], ReceptionParams], what: str = "cloud"):
         self.node, self.kind, self.deliver, self.params = node, kind, deliver, params
-        self.what = what  # one message, for people
+        self.what = what
         self.topic = node.resolve_topic_name(name)
         self.fixed = (f"qos_overrides.{self.topic}.subscription.reliability"
-                      in node._parameter_overrides)
+                      in parameter_overrides(node))
         self.reliability = BEST_EFFORT if params().reliability == "best_effort" else RELIABLE
         self.waiting: deque[bytes] = deque()
-        self.go_on = node.create_guard_condition(self._deliver_one)
-        self.look_again = node.create_guard_condition(self.adapt)
-        self.last_time: float | None = None  # monotonic, of the last cloud
-        self.needs: str | None = None  # by the cloud that waits, or the last one
+        self.deliver_trigger = node.create_guard_condition(self._deliver_one)
+        self.adapt_trigger = node.create_guard_condition(self.adapt)
+        self.last_time: float | None = None  # monotonic time of the last cloud
+        self.needs: str | None = None  # what the waiting or the last cloud needs
         self.needed_since: float | None = None  # monotonic
-        self.begun: float | None = None  # monotonic: since when the first one waits
+        self.waiting_since: float | None = None  # monotonic, of the first waiting cloud
         self.subscription: Any = None
-        self.met: list[Any] = []  # the publishers of now, or the last ones where there are none
+        self.last_publishers: list[Any] = []  # the present ones, if there are any
         self.arrivals = Arrivals()
 
     def open(self) -> None:
@@ -146,37 +159,37 @@ class Reception:
         self.adapt()
 
     def close(self) -> None:
-        """End the subscription. What waits is dropped; what is sent meanwhile is not missed."""
+        """End the subscription. Waiting clouds are dropped; later ones do not count as lost."""
         if self.subscription is not None:
             self.node.destroy_subscription(self.subscription)
         self.subscription = self.last_time = None
-        self.needs = self.needed_since = self.begun = None
-        self.arrivals.interrupted(len(self.waiting))
+        self.needs = self.needed_since = self.waiting_since = None
+        self.arrivals.record_interruption(len(self.waiting))
         self.waiting.clear()
 
     def _subscribe(self) -> None:
-        """What comes while a cloud is worked on waits at the middleware: as many as may wait."""
+        """Subscribe with a queue in the middleware for clouds that arrive during work."""
         kinds = [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH]
-        look = SubscriptionEventCallbacks(matched=lambda _: self.look_again.trigger(),
-                                          incompatible_qos=lambda _: self.look_again.trigger())
-        received: Any = self._received  # rclpy's annotation forgets that it may ask for the info
+        events = SubscriptionEventCallbacks(matched=lambda _: self.adapt_trigger.trigger(),
+                                          incompatible_qos=lambda _: self.adapt_trigger.trigger())
+        on_message: Any = self._on_message  # the annotation of rclpy lacks the message info
         profile = QoSProfile(depth=max(DEPTH, self.params().queue), reliability=self.reliability)
         self.subscription = self.node.create_subscription(
-            self.kind, self.topic, received, profile, raw=True, event_callbacks=look,
+            self.kind, self.topic, on_message, profile, raw=True, event_callbacks=events,
             qos_overriding_options=QoSOverridingOptions(
                 [*kinds, QoSPolicyKind.RELIABILITY] if self.fixed else kinds))
         self.arrivals.depth = self.subscription.qos_profile.depth
 
     def publishers(self) -> list[Any]:
-        """What is known of those that publish the topic."""
+        """Return the endpoint infos of all publishers of the topic."""
         return self.node.get_publishers_info_by_topic(self.topic)
 
     def adapt(self) -> None:
-        """Subscribe again if the publishers offer something else than before."""
+        """Subscribe again if the publishers offer another reliability than before."""
         if self.subscription is None:
             return
         wanted, publishers = self.params().reliability, self.publishers()
-        self.met = publishers or self.met
+        self.last_publishers = publishers or self.last_publishers
         offered = {info.qos_profile.reliability for info in publishers}
         if wanted == "auto" and offered:
             chosen = RELIABLE if offered == {RELIABLE} else BEST_EFFORT
@@ -188,28 +201,27 @@ class Reception:
         self.reliability = chosen
         self.node.destroy_subscription(self.subscription)
         self._subscribe()
-        self.node.get_logger().info(f"{self.topic} is received {self._how()} now")
+        self.node.get_logger().info(f"{self.topic} is received {self._reliability_label()} now")
 
-    def _how(self) -> str:
+    def _reliability_label(self) -> str:
         return self.subscription.qos_profile.reliability.name.lower().replace("_", " ")
 
-    def _received(self, data: bytes, info: dict) -> None:
-        """Take all that wait at the middleware, where nobody counts what is pushed out."""
-        infos, handle = [info], self.subscription.handle
+    def _on_message(self, data: bytes, info: dict) -> None:
+        """Take all messages from the middleware, which does not count the ones it drops."""
+        infos = [info]
         self.waiting.append(data)
-        with handle:
-            while taken := handle.take_message(self.kind, True):
-                self.waiting.append(taken[0])
-                infos.append(taken[1])
-        # One that has waited for its pose for a short while is not pushed out, or none would ever
-        # be answered where poses are later than the next cloud.
-        held = self.begun is not None and monotonic() - self.begun < HELD
-        first = [self.waiting.popleft()] if held else []
+        for later, later_info in take_messages(self.subscription, self.kind):
+            self.waiting.append(later)
+            infos.append(later_info)
+        # Newer clouds do not replace one that has waited for its pose only briefly. Otherwise no
+        # cloud would ever be processed if poses arrive later than the next cloud.
+        is_held = self.waiting_since is not None and monotonic() - self.waiting_since < MAX_HOLD_S
+        oldest = [self.waiting.popleft()] if is_held else []
         dropped = max(0, len(self.waiting) - self.params().queue)
         for _ in range(dropped):
             self.waiting.popleft()
-            self.begun = self.begun if held else None
-        self.waiting.extendleft(first)
+            self.waiting_since = self.waiting_since if is_held else None
+        self.waiting.extendleft(oldest)
         self.arrivals.add(infos, dropped, one_publisher=len(self.publishers()) < 2)
         self._deliver_one()
 
@@ -217,84 +229,88 @@ class Reception:
         if not self.waiting:
             return
         since = self.needed_since
-        patient = since is None or self._patient(monotonic() - since)
-        self.needs = self.deliver(self.waiting[0], patient)
-        self.last_time = monotonic()  # the work on a cloud is no silence
+        may_wait = since is None or self._may_wait(monotonic() - since)
+        self.needs = self.deliver(self.waiting[0], may_wait)
+        self.last_time = monotonic()  # after the work, which is not silence
         self.needed_since = None if self.needs is None else since or self.last_time
         if since and self.needs is None:
-            self.arrivals.begin_anew()
-        if self.needs is not None and patient:
-            self.begun = self.begun or self.last_time
+            self.arrivals.reset_window()
+        if self.needs is not None and may_wait:
+            self.waiting_since = self.waiting_since or self.last_time
             return
         self.waiting.popleft()
-        self.begun = None
+        self.waiting_since = None
         if self.waiting:
-            self.go_on.trigger()
+            self.deliver_trigger.trigger()
 
-    def _patient(self, waited: float) -> bool:
-        """Whether a cloud may wait, after so many seconds without one that got what it needs; after
-        max_wait only now and then, in case that comes again."""
-        beyond = waited - self.params().max_wait
-        return beyond < 0 or beyond % TRY_AGAIN > TRY_AGAIN - TRIAL
+    def _may_wait(self, elapsed: float) -> bool:
+        """Return True while a cloud may still wait for its input.
 
-    def try_again(self) -> None:
-        """What a cloud needs may have come, or it has waited for too long."""
+        elapsed: seconds since a cloud last got what it needed. After max_wait, clouds wait only
+        from time to time, in case the input comes back.
+        """
+        excess = elapsed - self.params().max_wait
+        return excess < 0 or excess % RETRY_PERIOD_S > RETRY_PERIOD_S - RETRY_DURATION_S
+
+    def retry(self) -> None:
+        """Deliver the waiting cloud again: its input may have arrived, or its time may be over."""
         if self.waiting and self.needs is not None:
-            self.go_on.trigger()
+            self.deliver_trigger.trigger()
 
     def values(self) -> dict[str, Any]:
-        """For the diagnostics."""
+        """Return the values for the diagnostics."""
         if self.subscription is None:
             return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped}
-        rate, expected = self.arrivals.rate(), self.expected()
+        rate, expected = self.arrivals.measure_rate(), self.expected_rate()
         return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped,
-                "reliability": self._how(),
+                "reliability": self._reliability_label(),
                 **({"rate_hz": f"{rate:.1f}"} if rate else {}),
                 **({"expected_rate_hz": f"{expected:.1f}"} if expected else {})}
 
-    def expected(self) -> float | None:
-        """Clouds a second, as input.rate or the first clouds say; None while too few have come."""
+    def expected_rate(self) -> float | None:
+        """Return input.rate or the rate of the first clouds in Hz; None after too few clouds."""
         return self.params().rate or self.arrivals.learned
 
     def problems(self) -> list[Problem]:
-        """What is wrong with the topic now, each with its remedy."""
+        """Return the present problems of the topic with their remedies."""
         if self.subscription is None:
             return []
-        found, params = [], self.params()
+        problems, params = [], self.params()
         publishers = self.publishers()
         if len(publishers) > 1:
             names = ", ".join(sorted(_name(p) for p in publishers))
-            found.append(("publishers", WARN, f"{len(publishers)} publishers on {self.topic} "
-                          f"({names}): their {self.what}s are mixed; remap all but one"))
-        if unheard := self._unheard(publishers):
-            found.append(unheard)
+            problems.append(("publishers", WARN, f"{len(publishers)} publishers on {self.topic} "
+                             f"({names}): their {self.what}s are mixed; remap all but one"))
+        if unheard := self._find_unheard_publisher(publishers):
+            problems.append(unheard)
         if self.waiting and self.needs is not None:
-            return [*found, ("waiting", WARN, f"the {self.what} on {self.topic} waits for "
-                             f"{self.needs}")]
+            return [*problems, ("waiting", WARN, f"the {self.what} on {self.topic} waits for "
+                                f"{self.needs}")]
         if silence := self._silence():
-            return [*found, silence]
-        expected, rate = self.expected(), self.arrivals.rate()
+            return [*problems, silence]
+        expected, rate = self.expected_rate(), self.arrivals.measure_rate()
         if expected and rate and rate < params.min_rate * expected:
-            found.append(("rate", WARN, f"{rate:.1f} {self.what}s a second on {self.topic} where "
-                          f"{expected:.1f} are expected (input.rate): {self._questions()[1]}"))
-        sent, lost, dropped = self.arrivals.recent()
-        enough = max(sent, SHARE_OF)  # one of the first two clouds is no half of them
-        if lost > params.max_lost * enough:
-            found.append(("lost", WARN, f"{lost} of the last {sent} {self.what}s on {self.topic} "
-                          f"were lost on the way; {self._remedy(publishers or self.met)}"))
-        if dropped > params.max_dropped * enough:
-            found.append(("dropped", WARN, f"{dropped} of the last {sent} {self.what}s on "
-                          f"{self.topic} were dropped, as newer ones came before their turn: the "
-                          "work on one takes too long for this machine, or it waits for poses"))
-        return found
+            problems.append(("rate", WARN, f"{rate:.1f} Hz on {self.topic} where {expected:.1f} Hz "
+                             f"are expected (input.rate): {self._questions()[1]}"))
+        sent, lost, dropped = self.arrivals.count_recent()
+        total = max(sent, WINDOW)  # so that one lost cloud of the first two is not a half
+        if lost > params.max_lost * total:
+            remedy = self._remedy(publishers or self.last_publishers)
+            problems.append(("lost", WARN, f"{lost} of the last {sent} {self.what}s on "
+                             f"{self.topic} were lost on the way; {remedy}"))
+        if dropped > params.max_dropped * total:
+            problems.append(("dropped", WARN, f"{dropped} of the last {sent} {self.what}s on "
+                             f"{self.topic} were dropped for newer ones: processing takes longer "
+                             "than their period on this machine, or they wait for poses"))
+        return problems
 
     def _silence(self) -> Problem | None:
-        """That nothing comes any more. A slow sensor is not silent between two clouds."""
-        params, expected = self.params(), self.expected()
+        """Return a problem if clouds have stopped; a slow sensor is not silent between clouds."""
+        params, expected = self.params(), self.expected_rate()
         period = 1 / expected if expected else 0.0
         silent = monotonic() - (self.last_time or monotonic())
-        error = max(params.error_after, SILENT * period)
-        stale = max(params.stale_after, STALLED * period)
+        error = max(params.error_after, SILENT_PERIODS * period)
+        stale = max(params.stale_after, STALE_PERIODS * period)
         if silent <= error:
             return None
         kind, level, limit = ("stale", STALE, stale) if silent > stale else ("silent", ERROR, error)
@@ -302,36 +318,36 @@ class Reception:
                 f"{self._questions()[0]}")
 
     def _questions(self) -> list[str]:
-        """Return QUESTIONS about the publishers, by their kind and names."""
-        names = sorted({_name(p) for p in self.met})
+        """Return the questions of QUESTIONS for the present publishers."""
+        names = sorted({_name(p) for p in self.last_publishers})
         if names and all(name.endswith("_player") for name in names):
             kind = "player"  # bag_player, rosbag2_player
         elif self.what != "cloud":
             kind = "detector"
-        else:  # topics of our own stages are NODE/output/points
+        else:  # nodes of this package publish NODE/output/points
             kind = "node" if self.topic.endswith("/output/points") else "sensor"
         return [question.format(f" {', '.join(names)}" if names else "")
                 for question in QUESTIONS[kind]]
 
-    def _unheard(self, publishers: list[Any]) -> Problem | None:
-        """A best-effort publisher, where adapt() may not make the subscription fit it."""
+    def _find_unheard_publisher(self, publishers: list[Any]) -> Problem | None:
+        """Return a problem for best-effort publishers that adapt() may not adapt to."""
         names = [_name(p) for p in publishers if p.qos_profile.reliability == BEST_EFFORT]
         adapts = not self.fixed and self.params().reliability != "reliable"
         if not names or adapts or self.subscription.qos_profile.reliability != RELIABLE:
             return None
         remedy = (f"set qos_overrides.{self.topic}.subscription.reliability to best_effort"
                   if self.fixed else "set input.reliability to auto")
-        return ("unheard", WARN, f"{', '.join(sorted(names))} on {self.topic} is not heard, as it "
-                f"offers best effort and reliable is asked for: {remedy}, or let it publish "
-                "reliable")
+        return ("unheard", WARN, f"{', '.join(sorted(names))} on {self.topic} offers best effort "
+                f"but the subscription is reliable, so no messages arrive: {remedy}, or let it "
+                "publish reliable")
 
     def _remedy(self, publishers: list[Any]) -> str:
         offered = {p.qos_profile.reliability for p in publishers}
         if BEST_EFFORT in offered:
             sysctl = (f", or set net.core.rmem_max to {4 * SOCKET_BUFFER} (sysctl) and start this "
-                      "node again") if socket_buffer() < SOCKET_BUFFER else ""
+                      "node again") if read_socket_buffer_size() < SOCKET_BUFFER else ""
             return (f"let {_name(publishers[0])} publish reliable, or start it with "
-                    f"FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}{sysctl}")
+                    f"FASTRTPS_DEFAULT_PROFILES_FILE={FASTDDS_PROFILE}{sysctl}")
         if self.subscription.qos_profile.reliability == BEST_EFFORT:
             return "receive it reliable: input.reliability auto, and no qos_overrides"
         return ("raise the depth of the publisher's queue; between machines also net.core.rmem_max "

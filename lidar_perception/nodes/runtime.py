@@ -1,4 +1,4 @@
-"""What all nodes share: parameters from a dataclass, QoS, diagnostics, guarded callbacks."""
+"""Base class of all nodes: parameters from dataclasses, QoS, diagnostics, receive callbacks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -26,7 +25,11 @@ from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 from std_msgs.msg import Float64
 
-from lidar_perception.nodes.declared import as_declared, declare
+from lidar_perception.nodes.parameter_declaration import (
+    convert_to_declared_type,
+    declare_parameters,
+)
+from lidar_perception.nodes.rclpy_compat import UnknownParameterError, parameter_names
 from lidar_perception.nodes.reception import Problem, Reception
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.types import InputError, closest_name
@@ -41,55 +44,47 @@ RELIABLE = QoSProfile(depth=10)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-JUMP_NS = 10**9  # stamps that go back by more than this are a bag that starts again
+JUMP_NS = 10**9  # a stamp that is earlier by more than this means that a bag has restarted
 WAITING = "waiting for input"
-LOG_PERIOD = 60.0  # seconds before the same problem is logged again
-MAX_KINDS = 1000   # of messages whose last time is known
-
-
-class UnknownParameter(ParameterNotDeclaredException):
-    """A parameter that is set but not declared; rclpy catches it, and answers with its message.
-
-    rclpy 7's own message is "Invalid access to undeclared parameter(s): []", because any() has
-    taken the name from a generator (rclpy/node.py, _check_undeclared_parameters).
-    """
-
-    def __init__(self, message: str):
-        Exception.__init__(self, message)
+LOG_PERIOD_S = 60.0     # before the same problem is logged again
+MAX_LOGGED_KINDS = 1000  # kinds of messages with a remembered time
 
 
 class LidarNode(Node):
-    """A node whose callbacks never end it: bad input becomes a diagnostic.
+    """A node that reports bad input as a diagnostic instead of ending.
 
-    params is a dataclass of params.py; its fields are declared as ROS parameters, and a change at
-    run time goes through the same checks. So is robot, what the node has besides its algorithm's
-    numbers: CloudNodeParams, BoxNodeParams ... where it takes clouds; transforms are its frames
-    then.
+    Args:
+        name: name of the node.
+        params: dataclass with the parameters of the algorithm. Its fields are declared as ROS
+            parameters, and changes at run time are checked in the same way.
+        node_params: dataclass with the other parameters, such as CloudNodeParams or BoxNodeParams,
+            for nodes that subscribe to clouds.
+        options: further arguments of rclpy.node.Node.
     """
 
-    transforms: Any = None  # of transforms.py
-    writes_files: ClassVar[bool] = False  # that close() completes, so a signal waits for the work
+    transforms: Any = None  # of type Transforms for nodes that subscribe to clouds
+    writes_files: ClassVar[bool] = False  # True: after a signal the work is finished, for close()
 
-    def __init__(self, name: str, params: Any, robot: Any = None, **options: Any):
+    def __init__(self, name: str, params: Any, node_params: Any = None, **options: Any):
         super().__init__(name, **options)
-        self.params = declare(self, params)
-        self.robot = robot and declare(self, robot)
+        self.params = declare_parameters(self, params)
+        self.node_params = node_params and declare_parameters(self, node_params)
         self.add_pre_set_parameters_callback(self._before_set)
         self.add_on_set_parameters_callback(self._on_set)
-        self.stop = Future()  # done when the node shall end; set from any thread
+        self.stop = Future()  # set from any thread to end the node
         self.state = (WARN, WAITING)
-        self.active = True  # listens to its inputs
-        self.forget()
-        self._present: set[str] = set()  # kinds of problems
-        self._logged: dict[str, float] = {}  # kind of message -> when it was logged
+        self.active = True  # subscribed to its inputs
+        self.reset_state()
+        self._present: set[str] = set()  # kinds of present problems
+        self._logged: dict[str, float] = {}  # kind of message -> time of its last log line
         self._last_logged = ""
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
         self._processing_time = self.create_publisher(Float64, "~/debug/processing_time_ms",
                                                       RELIABLE)
-        self.every(1.0, self._tick)
+        self.add_steady_timer(1.0, self._tick)
 
-    def forget(self) -> None:
-        """What is known of the input and output so far."""
+    def reset_state(self) -> None:
+        """Reset the counts, and forget all inputs and outputs."""
         self.counts: dict[str, Any] = {"frames": 0, "lost": 0}
         self.last_stamp_ns = 0
         self.times: list[float] = []
@@ -97,62 +92,68 @@ class LidarNode(Node):
         self.inputs: list[Any] = []  # with open() and close()
         self._outputs: list[Any] = []
 
-    def every(self, seconds: float, work: Callable[[], None]) -> None:
-        """Do it again and again, also while the clock of a simulation stands."""
-        self.create_timer(seconds, work, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    def add_steady_timer(self, seconds: float, callback: Callable[[], None]) -> None:
+        """Call callback() periodically, also while the clock of a simulation stands still."""
+        self.create_timer(seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def count_lost(self, event: Any) -> None:
-        """Of a subscription: messages that were lost on the way."""
+        """Count the messages that the middleware reports as lost."""
         self.counts["lost"] += event.total_count_change
 
     def start(self) -> None:
-        """Called once, when the node is made and before it spins."""
+        """Start the work of the node; called once before it spins."""
 
     def is_ready(self) -> bool:
-        """Return True once the node works on its input."""
+        """Return True once the node processes its input."""
         return True
 
     def _before_set(self, changes: list[Parameter]) -> list[Parameter]:
         if unknown := [c.name for c in changes if not self.has_parameter(c.name)]:
-            guess = closest_name(unknown[0], self._parameters)
-            raise UnknownParameter(f"{self.get_fully_qualified_name()} has no parameter "
+            guess = closest_name(unknown[0], parameter_names(self))
+            raise UnknownParameterError(f"{self.get_fully_qualified_name()} has no parameter "
                                    f"{unknown[0][:80]!r}" + (f"; did you mean {guess!r}?"
                                                              if guess else ""))
-        return [as_declared(c, self.get_parameter(c.name).type_) for c in changes]
+        return [convert_to_declared_type(c, self.get_parameter(c.name).type_) for c in changes]
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            own, robot = (group and with_values(
+            params, node_params = (group and with_values(
                 group, {c.name: c.value for c in changes if c.name in flatten(group)})
-                for group in (self.params, self.robot))
+                for group in (self.params, self.node_params))
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        self.params, self.robot = own, robot
+        self.params, self.node_params = params, node_params
         return SetParametersResult(successful=True)
 
     def input(self, topic: str, type_name: str, callback: Callable,
               *qos: QoSProfile, private: bool = True,
               needs: Callable[[Any], str | None] = lambda _: None) -> None:
-        """Subscribe to ~/input/TOPIC, or with private=False to the name as it is. callback gets
-        rosbags' class of the message, the one that offline code reads from bags: it views the
-        received bytes, where rclpy's own class copies them several times. Types that rosbags does
-        not come with are of rclpy's class. With several qos each is subscribed to, as no one of
-        them may fit all publishers. Without qos the topic is received as reception.py does: needs
-        says what a cloud still waits for, which comes by another input, and None if nothing.
+        """Subscribe to a topic.
+
+        Args:
+            topic: ~/input/TOPIC, or with private=False the name itself.
+            type_name: message type such as "std_msgs/msg/Bool".
+            callback: called with each message, in the class of rosbags that offline code reads from
+                bags. It is a view of the received bytes, which rclpy copies several times. Types
+                that rosbags does not know come in the class of rclpy.
+            qos: each profile gets its own subscription, as one may not match all publishers.
+                Without any, the topic has a Reception.
+            private: the topic is below ~/input.
+            needs: what a cloud still waits for from another input, or None.
         """
         name = f"~/input/{topic}" if private else topic
         _warm_up_type(type_name)
 
-        def guarded(data: bytes, patient: bool = False) -> str | None:
+        def receive(data: bytes, patient: bool = False) -> str | None:
             missing = None
             try:
-                msg = decoded(data, type_name)
+                msg = decode_message(data, type_name)
                 if type_name == CLOUD:
                     self.frame_id = msg.header.frame_id
-                    missing = self.transforms.missing(msg)
+                    missing = self.transforms.find_missing_input(msg)
                 missing = missing or needs(msg)
                 if missing is None or not patient:
-                    callback(self.transforms.corrected(msg) if type_name == CLOUD else msg)
+                    callback(self.transforms.deskew_cloud(msg) if type_name == CLOUD else msg)
             except InputError as error:
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {error}")
             except Exception as error:
@@ -161,42 +162,45 @@ class LidarNode(Node):
                             f"{error}; this is a bug, please report it with the message")
             if qos:
                 for reception in self._receptions():
-                    reception.try_again()
+                    reception.retry()
             return missing
 
-        received: Any = guarded  # rclpy's annotation has no result
+        untyped_receive: Any = receive  # the annotation of rclpy has no result
         kind, what = message_class(type_name), "cloud" if type_name == CLOUD else "array"
 
-        def refused(event: Any) -> None:
+        def report_incompatible(event: Any) -> None:
             if len(qos) > 1:
-                return  # another of them fits
+                return  # another profile matches
             topic = self.resolve_topic_name(name)
             remedy = ("let it publish transient local (ros2 bag play: --qos-profile-overrides-path)"
                       if event.last_policy_kind == QoSPolicyKind.DURABILITY else
                       "let it publish reliable, or set "
                       f"qos_overrides.{topic}.subscription.reliability to best_effort")
-            self.report(WARN, f"a publisher on {topic} offers less than is asked for, and is not "
-                        f"heard: {remedy}")
+            self.report(WARN, f"a publisher on {topic} offers an incompatible QoS, so none of its "
+                        f"messages arrive: {remedy}")
 
-        events = SubscriptionEventCallbacks(message_lost=self.count_lost, incompatible_qos=refused)
+        events = SubscriptionEventCallbacks(message_lost=self.count_lost,
+                                            incompatible_qos=report_incompatible)
 
         def subscribe(profile: QoSProfile) -> Any:
             return self.create_subscription(
-                kind, name, received, profile, raw=True, event_callbacks=events,
+                kind, name, untyped_receive, profile, raw=True, event_callbacks=events,
                 qos_overriding_options=QoSOverridingOptions.with_default_policies()
                 if profile is qos[0] else None)
 
-        added: list[Any] = (
-            [Subscribed(self, partial(subscribe, profile)) for profile in qos]
-            or [Reception(self, kind, name, guarded, lambda: self.robot.input, what)])
-        self.inputs += added
+        inputs: list[Any] = (
+            [MessageInput(self, partial(subscribe, profile)) for profile in qos]
+            or [Reception(self, kind, name, receive, lambda: self.node_params.input, what)])
+        self.inputs += inputs
         if self.active:
-            for made in added:
-                made.open()
+            for new_input in inputs:
+                new_input.open()
 
     def output(self, topic: str, type_name: str, qos: QoSProfile = RELIABLE):
-        """Publisher of ~/output/TOPIC, or of any name that starts with ~ or /; it takes encode()d
-        messages."""
+        """Create a publisher of ~/output/TOPIC, or of any name that starts with ~ or /.
+
+        It publishes encode()d messages.
+        """
         name = topic if topic[0] in "~/" else f"~/output/{topic}"
         _warm_up_type(type_name)
         publisher = self.create_publisher(
@@ -206,28 +210,30 @@ class LidarNode(Node):
         return publisher
 
     def report(self, level: bytes, message: str, expected: bool = False) -> None:
-        """Set the diagnostic state. A change to a message of another kind, which is more than other
-        numbers in it, is logged and published at once. What is expected, such as that a node waits
-        at its start, is no warning in the log."""
+        """Set the diagnostic state.
+
+        A message that differs from the last one in more than its numbers is logged and published at
+        once. Expected states, such as waiting for input after the start, are logged as information.
+        """
         kind, before = _kind_of(message), (self.state[0], _kind_of(self.state[1]))
         self.state = (level, message)
         if (level, kind) != before:
-            self._log_seldom(kind, OK if expected else level, message)
+            self._log_rarely(kind, OK if expected else level, message)
             self.publish_diagnostics()
 
-    def _log_seldom(self, kind: str, level: bytes, message: str) -> None:
-        """A problem at most once in LOG_PERIOD; what is no problem unless it was the last to say,
-        so that a log ends with how it is."""
+    def _log_rarely(self, kind: str, level: bytes, message: str) -> None:
+        """Log a problem at most once in LOG_PERIOD_S, and an OK state unless it was logged last, so
+        that the log always ends with the present state."""
         now = monotonic()
         if (kind != self._last_logged if level == OK else
-                now - self._logged.get(kind, -LOG_PERIOD) >= LOG_PERIOD):
-            if len(self._logged) > MAX_KINDS:
+                now - self._logged.get(kind, -LOG_PERIOD_S) >= LOG_PERIOD_S):
+            if len(self._logged) > MAX_LOGGED_KINDS:
                 self._logged.clear()
             self._logged[kind], self._last_logged = now, kind
             self._log(level, message)
 
     def _log(self, level: bytes, message: str) -> None:
-        if level == OK:  # one line a level: rclpy ties the level to the place of the call
+        if level == OK:  # one call for each level: rclpy binds the level to the calling line
             self.get_logger().info(message)
         elif level == WARN:
             self.get_logger().warning(message)
@@ -236,11 +242,11 @@ class LidarNode(Node):
 
     @contextmanager
     def frame(self, stamp_ns: int):
-        """Around the work on one cloud: counts it, times it, notices that time went back."""
+        """Count and time the work on one cloud, and detect stamps that jump back."""
         if stamp_ns < self.last_stamp_ns - JUMP_NS:
             self.counts["time_went_back"] = self.counts.get("time_went_back", 0) + 1
-            self.get_logger().info("time went back, as of a bag that starts again; what waited "
-                                   "from before is dropped (said once, counted in /diagnostics)",
+            self.get_logger().info("time jumped back, as when a bag restarts; pending data is "
+                                   "dropped (logged once, counted in /diagnostics)",
                                    once=True)
         self.last_stamp_ns = stamp_ns
         begin = perf_counter()
@@ -251,10 +257,10 @@ class LidarNode(Node):
         self.counts["frames"] += 1
 
     def publish_diagnostics(self) -> None:
-        """The state, and what is wrong with the inputs and with the node's name."""
+        """Publish the state with the problems of the inputs and of the name of the node."""
         level, message = self.state
         values = dict(self.counts, last_stamp_ns=self.last_stamp_ns)
-        for source in reversed(self._sources()):  # of equal names that of the first input
+        for source in reversed(self._sources()):  # the first input wins for equal keys
             values.update(source.values())
         for name in ("lost", "dropped"):
             if numbers := [r.values()[name] for r in self._receptions()]:
@@ -275,14 +281,14 @@ class LidarNode(Node):
             self._diagnostics.publish(array)
 
     def _receptions(self) -> list[Reception]:
-        return [made for made in self.inputs if isinstance(made, Reception)]
+        return [source for source in self.inputs if isinstance(source, Reception)]
 
     def _sources(self) -> list[Any]:
-        """What has values and problems of its own."""
+        """Return the objects with their own diagnostic values and problems."""
         return [*self._receptions(), *([self.transforms] if self.transforms else [])]
 
     def _problems(self) -> list[Problem]:
-        """Each is logged when it comes up, at most once in LOG_PERIOD."""
+        """Return all present problems and log the new ones."""
         found = [p for source in self._sources() for p in source.problems()]
         name, namespace = self.get_name(), self.get_namespace()
         if self.get_node_names_and_namespaces().count((name, namespace)) > 1:
@@ -292,36 +298,41 @@ class LidarNode(Node):
         before, self._present = self._present, {kind for kind, _, _ in found}
         for kind, level, message in found:
             if kind not in before:
-                self._log_seldom(kind, level, message)
+                self._log_rarely(kind, level, message)
         return found
 
     def _hardware_id(self) -> str:
-        """The sensor, as its clouds and the namespace name it; tells two sensors apart."""
+        """Return the namespace and the frame of the clouds, which identify the sensor."""
         parts = self.get_namespace().strip("/"), self.frame_id
         return "/".join(filter(None, parts)) or "lidar_perception"
 
     def _tick(self) -> None:
         for reception in self._receptions():
-            reception.adapt()  # where the middleware has no events that say so
-            reception.try_again()
+            reception.adapt()  # for middleware without events
+            reception.retry()
         self.publish_diagnostics()
 
     def spin(self, executor: Executor) -> None:
-        """Work until stop is done."""
+        """Spin until self.stop is done."""
         executor.spin_until_future_complete(self.stop)
 
     def close(self) -> None:
-        """Called once before the node is destroyed. InputError where what it holds is lost."""
+        """Write what is left; called once before the node is destroyed.
+
+        Raises:
+            InputError: the results cannot be written.
+        """
 
 
-def decoded(data: bytes, type_name: str) -> Any:
+def decode_message(data: bytes, type_name: str) -> Any:
+    """Decode CDR to the class of rosbags, or of rclpy for types that rosbags does not know."""
     if type_name in load_typestore().fielddefs:
         return decode(data, type_name)
     return deserialize_message(data, message_class(type_name))
 
 
-class Subscribed:
-    """An input other than clouds."""
+class MessageInput:
+    """An input with a plain subscription, for messages other than clouds."""
 
     def __init__(self, node: Node, subscribe: Callable[[], Any]):
         self.node, self.subscribe = node, subscribe
@@ -337,11 +348,11 @@ class Subscribed:
 
 
 def _kind_of(message: str) -> str:
-    """The message without its numbers."""
+    """Return the message with all numbers replaced by 0."""
     return re.sub(r"\d[\d.,e+-]*", "0", message)
 
 
 def _warm_up_type(type_name: str) -> None:
-    """rosbags writes its code for a type on first use: do that before the first message."""
+    """Let rosbags generate its code for a type before the first message arrives."""
     if type_name in load_typestore().fielddefs:
         decode(encode(bag_message(type_name)), type_name)

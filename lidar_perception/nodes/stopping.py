@@ -1,4 +1,4 @@
-"""How a node's process ends at a signal, also while it starts, or while DDS is stuck."""
+"""Termination of a node process by a signal, also during its start or while DDS is stuck."""
 
 from __future__ import annotations
 
@@ -9,37 +9,41 @@ import signal
 import threading
 from collections.abc import Callable, Collection
 
-PATIENCE = 0.7  # seconds for the current work, before `leave` ends the process without it
-POLL = 0.05  # seconds, while the guard is loaded
+WORK_TIMEOUT_S = 0.7  # for the current work, before force_exit() ends the process
+POLL_PERIOD_S = 0.05  # while the guard is loaded
 
 
 class Stop:
-    """Takes the given signals, which every thread must block, in threads of its own: as exceptions
-    in the main thread they could be lost in a destructor, or cut short what must be finished.
+    """Handler of signals in threads of its own; every thread of the process must block the signals.
 
-    `react` is called at the first signal; until there is a node, it ends the process. Where the
-    work goes on for PATIENCE seconds after that, `leave` is called. The node calls closing() before
-    it writes its last, closed() after that.
+    An exception in the main thread could be lost in a destructor, or interrupt work that must be
+    finished. Fast DDS can wait for a lock in shared memory that a dead process still holds, while
+    rclpy holds the interpreter lock, so that no Python thread runs. The compiled guard.py needs no
+    interpreter. It takes a second to load, and longer to compile; a Python thread waits for
+    signals until then.
 
-    Fast DDS can wait for a lock in shared memory that a process which died still holds, and rclpy
-    holds the interpreter's lock meanwhile, so no Python thread runs: guard.py needs none. It takes
-    a second to load, and longer to compile, so a Python thread listens until then.
+    The node calls begin_closing() before it writes its results, and finish_closing() afterwards.
+
+    Attributes:
+        on_signal: called at the first signal. It ends the process until it is replaced.
+        force_exit: called if the work continues for WORK_TIMEOUT_S seconds after the signal.
+        requested: a signal has arrived.
     """
 
     def __init__(self, signals: Collection[signal.Signals]) -> None:
-        self.react: Callable[[], object] = lambda: os._exit(0)
-        self.leave: Callable[[], object] | None = None
-        self.asked = False  # a signal has come
+        self.on_signal: Callable[[], object] = lambda: os._exit(0)
+        self.force_exit: Callable[[], object] | None = None
+        self.requested = False
         self._closing = threading.Event()
         self._leaving = threading.Lock()
         self._awake, pipe = os.pipe()
         threading.Thread(target=self._wait, daemon=True).start()
-        # A descriptor to read signals from: in sigwait(3) a thread does not block them.
+        # A descriptor, because a thread in sigwait(3) does not block the signals.
         mask = sum(1 << number - 1 for number in signals).to_bytes(128, "little")  # sigset_t
         arrived, loaded = ctypes.CDLL(None).signalfd(-1, mask, os.O_CLOEXEC), threading.Event()
         listener = threading.Thread(target=_listen, args=(arrived, loaded, pipe), daemon=True)
         listener.start()
-        from lidar_perception.nodes import guard  # NumPy and Numba: seconds on a busy machine
+        from lidar_perception.nodes import guard  # takes seconds, as it imports NumPy and Numba
         loaded.set()
         listener.join()
         self._state = guard.start_guard(arrived, pipe)
@@ -47,30 +51,32 @@ class Stop:
 
     def _wait(self) -> None:
         os.read(self._awake, 1)
-        self.asked = True
-        self.react()
-        if not self._closing.wait(PATIENCE) and self.leave:
+        self.requested = True
+        self.on_signal()
+        if not self._closing.wait(WORK_TIMEOUT_S) and self.force_exit:
             with self._leaving:
                 if not self._closing.is_set():
-                    self.leave()
+                    self.force_exit()
 
-    def closing(self) -> None:
-        """The work is done; what follows may take its time. While leave() ends the process this
-        does not return."""
+    def begin_closing(self) -> None:
+        """Suspend the time limit: the work is done, and the results are written now.
+
+        Does not return while force_exit() ends the process.
+        """
         with self._leaving:
             self._closing.set()
         self._state[0] = self._closing_phase
 
-    def closed(self, code: int) -> None:
-        """All is written: the process ends with this code within guard.TEARDOWN seconds."""
+    def finish_closing(self, code: int) -> None:
+        """Let the process end with this code within guard.TEARDOWN_S seconds."""
         self._state[:] = self._closed_phase, code
-        self.react = lambda: None
+        self.on_signal = lambda: None
         os.kill(os.getpid(), signal.SIGTERM)  # wakes the guard, if no signal has
 
 
 def _listen(arrived: int, loaded: threading.Event, pipe: int) -> None:
-    """Until the guard is loaded."""
+    """Pass the first signal to the pipe until the guard is loaded."""
     while not loaded.is_set():
-        if select.select([arrived], [], [], POLL)[0]:
+        if select.select([arrived], [], [], POLL_PERIOD_S)[0]:
             os.write(pipe, b"\0")
             return

@@ -1,4 +1,4 @@
-"""Tracks of the detections that a node gets or makes, published. The work is the same in both."""
+"""Tracking of detections and publishing of the tracks, for the tracker and the detector nodes."""
 
 from __future__ import annotations
 
@@ -25,15 +25,18 @@ from msg_utils.messages import message_class, ros_message
 from msg_utils.stamps import SECOND, header_message, to_ns
 
 DETECTIONS_3D = "vision_msgs/msg/Detection3DArray"
-OUTLIVED = 2.5    # periods of the input, for which markers stay at least
-LONGEST = 1e6     # seconds; a message has 32 bits for them
-RATE_OVER = 10.0  # seconds, over which births and ends are counted as a rate
+MIN_LIFETIME_PERIODS = 2.5  # lifetime of markers in periods of the input
+MAX_LIFETIME_S = 1e6        # messages have 32 bits for the seconds
+RATE_WINDOW_S = 10.0        # for the rates of new and ended tracks
 
 
 class TrackOutputs:
     """~/output/tracks, and ~/output/tracks_3d where vision_msgs is installed.
 
-    params: where the node's groups `tracking` and `ego` are; clouds: as EgoInput has it.
+    Args:
+        node: the node that publishes.
+        params: returns the present parameters with the groups tracking and ego.
+        clouds: the node subscribes to clouds, see EgoInput.
     """
 
     def __init__(self, node: LidarNode,
@@ -41,29 +44,36 @@ class TrackOutputs:
         self.node, self.params = node, params
         self.tracker = Tracker(params().tracking)
         self.ego = EgoInput(node, lambda: params().ego, clouds)
-        self.poses_from = NO_SOURCE, True, 0  # of the last frame
+        self.pose_source = NO_SOURCE, True, 0  # of the last frame
         self.trails = Trails()
         self.frame_id: str | None = None
-        self.shown: Any = ()
+        self.marker_keys: Any = ()
         self.markers = node.output("tracks", MARKERS)
         self.array = node.create_publisher(message_class(DETECTIONS_3D), "~/output/tracks_3d",
                                            RELIABLE) if has_detections_3d() else None
-        self.counted: deque[tuple[float, int, int]] = deque()  # seconds, born, ended
+        self.count_history: deque[tuple[float, int, int]] = deque()  # seconds, born, ended
 
     def publish(self, header: Any, detections: Detections,
                 xyz: np.ndarray | None = None) -> str | None:
-        """Track the detections of one frame, weak ones too, with its scan xyz (N, 3) where the
-        node takes the clouds. Returns what was wrong, None if nothing was.
+        """Track the detections of one frame and publish the tracks.
 
-        A frame that is older than the last one, or has its stamp, is not answered: what is known
-        is of another time."""
+        Nothing is published for a frame that is not newer than the last one.
+
+        Args:
+            header: header of the frame.
+            detections: detections, also those with low scores.
+            xyz: (N, 3) scan of the frame, if the node subscribes to clouds.
+
+        Returns:
+            The problem of the frame with its remedy, or None.
+        """
         stamp, tracker = to_ns(header.stamp), self.tracker
-        mixed, before = self._same_sensor(header.frame_id), self.poses_from
-        pose = self.ego.pose(header, xyz)
-        self.poses_from = self.ego.source, self.ego.carried, self.ego.begun
-        if before[0] != NO_SOURCE and before != self.poses_from:
+        sensor_problem, before = self._check_sensor(header.frame_id), self.pose_source
+        pose = self.ego.find_pose(header, xyz)
+        self.pose_source = self.ego.source, self.ego.is_mounting_known, self.ego.icp_restarts
+        if before[0] != NO_SOURCE and before != self.pose_source:
             tracker.reset()  # another fixed frame
-        problem = mixed or self.ego.problem(header.frame_id, stamp)
+        problem = sensor_problem or self.ego.find_problem(header.frame_id, stamp)
         tracker.params = self.params().tracking
         tracks = tracker(detections, stamp, pose)
         if tracker.taken:
@@ -71,39 +81,39 @@ class TrackOutputs:
         self._count(stamp, len(tracks))
         return tracker.problem or problem
 
-    def _same_sensor(self, frame_id: str) -> str | None:
+    def _check_sensor(self, frame_id: str) -> str | None:
         before, self.frame_id = self.frame_id, frame_id
         if before in (None, frame_id):
             return None
         self.tracker.reset()
-        return (f"detections of '{before}' and of '{frame_id}' are mixed, and tracks end at every "
-                "change; give each sensor a tracker of its own")
+        return (f"detections in '{before}' and in '{frame_id}' are mixed, and tracks end at every "
+                "change; start one tracker for each sensor")
 
     def _send(self, header: Any, stamp: int, tracks: Tracks) -> None:
-        output = self.node.robot.output
+        output = self.node.node_params.output
         trails = self.trails(tracks, self.tracker.pose, stamp, output.trail)
         message = make_track_markers(
             tracks.ids, tracks.detections, tracks.velocities, tracks.moving, trails, header,
-            bag_message, previous=self.shown, lifetime_ns=lifetime_ns(self.node),
+            bag_message, previous=self.marker_keys, lifetime_ns=find_marker_lifetime_ns(self.node),
             extras=[{"seen": bool(seen), "age": round(float(age), 3)}
                     for seen, age in zip(tracks.seen, tracks.ages)])
-        self.shown = marker_keys(message)
+        self.marker_keys = marker_keys(message)
         self.markers.publish(encode(message))
         if self.array is not None and self.array.get_subscription_count():
-            found = tracks.detections
+            detections = tracks.detections
             self.array.publish(to_detection_array(
-                found.boxes, [CLASSES[i] for i in found.class_ids], found.scores, ids=tracks.ids,
-                covariances=tracks.pose_covariances(), make=ros_message,
+                detections.boxes, [CLASSES[i] for i in detections.class_ids], detections.scores,
+                ids=tracks.ids, covariances=tracks.pose_covariances(), make=ros_message,
                 header=header_message(stamp, header.frame_id, ros_message)))
 
     def _count(self, stamp: int, reported: int) -> None:
         tracker, now = self.tracker, stamp / 1e9
-        if self.counted and not 0 <= now - self.counted[-1][0] <= RATE_OVER:
-            self.counted.clear()  # time jumped, or there are no stamps
-        self.counted.append((now, tracker.born, tracker.ended))
-        while now - self.counted[0][0] > RATE_OVER or len(self.counted) > 1000:
-            self.counted.popleft()
-        before, born, ended = self.counted[0]
+        if self.count_history and not 0 <= now - self.count_history[-1][0] <= RATE_WINDOW_S:
+            self.count_history.clear()  # time jumped, or there are no stamps
+        self.count_history.append((now, tracker.born, tracker.ended))
+        while now - self.count_history[0][0] > RATE_WINDOW_S or len(self.count_history) > 1000:
+            self.count_history.popleft()
+        before, born, ended = self.count_history[0]
         self.node.counts.update(ego=self.ego.source, tracks=reported, alive=tracker.alive,
                                 born=tracker.born, ended=tracker.ended)
         if now > before:
@@ -111,16 +121,19 @@ class TrackOutputs:
             self.node.counts["ended_per_s"] = f"{(tracker.ended - ended) / (now - before):.2f}"
 
 
-def lifetime_ns(node: LidarNode) -> int:
-    """How long the node's markers stay without newer ones; 0 for ever. Those of a slow sensor stay
-    until the next come."""
-    seconds = node.robot.output.marker_lifetime
-    rates = [rate for made in node._receptions() if (rate := made.expected())]
+def find_marker_lifetime_ns(node: LidarNode) -> int:
+    """Return the lifetime of the markers of a node, 0 for unlimited.
+
+    It is at least MIN_LIFETIME_PERIODS periods of the input, for slow sensors.
+    """
+    seconds = node.node_params.output.marker_lifetime
+    rates = [rate for reception in node._receptions()
+             if (rate := reception.expected_rate())]
     if seconds and rates:
-        seconds = max(seconds, min(OUTLIVED / min(rates), LONGEST))
+        seconds = max(seconds, min(MIN_LIFETIME_PERIODS / min(rates), MAX_LIFETIME_S))
     return int(seconds * SECOND)
 
 
 def has_detections_3d() -> bool:
-    """Whether vision_msgs is installed."""
+    """Return True if vision_msgs is installed."""
     return importlib.util.find_spec("vision_msgs") is not None

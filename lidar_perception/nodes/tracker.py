@@ -1,4 +1,4 @@
-"""~/input/detections of any detector -> ~/output/tracks: ids, velocities, and steadier boxes."""
+"""Node that tracks the detections of any detector: ~/input/detections -> ~/output/tracks."""
 
 from __future__ import annotations
 
@@ -17,8 +17,11 @@ from msg_utils.stamps import to_ns
 
 
 class TrackerNode(ManagedNode):
-    """A frame without detections is an array that says when it was: of markers a DELETE or
-    DELETEALL with its header."""
+    """Tracks boxes over frames.
+
+    A frame without detections must be an array with its stamp: for markers, a DELETE or DELETEALL
+    with the header of the frame.
+    """
 
     waits_for = "detections", "detections_3d"
 
@@ -28,15 +31,18 @@ class TrackerNode(ManagedNode):
     def configure(self) -> None:
         self.tracks = TrackOutputs(self, lambda: self.params, clouds=False)
         self.input("detections", MARKERS, self.on_markers,
-                   needs=lambda m: self.tracks.ego.needed(array_header(m)) if m.markers else None)
+                   needs=self._find_missing_pose)
         if has_detections_3d():
             self.input("detections_3d", DETECTIONS_3D, self.on_detections,
-                       needs=lambda m: self.tracks.ego.needed(m.header))
+                       needs=lambda m: self.tracks.ego.find_missing_pose(m.header))
+
+    def _find_missing_pose(self, msg: Any) -> str | None:
+        return self.tracks.ego.find_missing_pose(array_header(msg)) if msg.markers else None
 
     def on_markers(self, msg: Any) -> None:
         if not msg.markers:
-            raise InputError("an array without a marker does not say of when it is; send a "
-                             "DELETEALL with the header of the frame. It is left out")
+            raise InputError("ignored an array without a marker, which has no stamp; send a "
+                             "DELETEALL with the header of the frame")
         self._track(array_header(msg), from_marker_array(msg))
 
     def on_detections(self, msg: Any) -> None:
@@ -46,8 +52,9 @@ class TrackerNode(ManagedNode):
         self.frame_id = header.frame_id
         with self.frame(to_ns(header.stamp)):
             problem = self.tracks.publish(header, to_detections(objects))
-        said = [problem] if problem else []
+        problems = [problem] if problem else []
         if unknown := find_unknown_classes(objects.labels):
-            said.append(f"detections of the classes {', '.join(unknown)[:80]} are tracked as Misc: "
-                        f"call them {', '.join(DETECTED)} in markers' ns or in class_id")
-        self.report(WARN if said else OK, "; ".join(said) or "tracking")
+            problems.append(f"detections of the classes {', '.join(unknown)[:80]} are tracked as "
+                            f"Misc: name them {', '.join(DETECTED)} in the ns of the markers or in "
+                            "class_id")
+        self.report(WARN if problems else OK, "; ".join(problems) or "tracking")

@@ -1,6 +1,6 @@
-"""TF and odometry as a node needs them: how its sensor is mounted, where results go, how it moves.
+"""TF and odometry of a node: the mounting and the motion of its sensor, and the output frame.
 
-The tree is our own, over /tf and /tf_static, so that it is the same with and without tf2_ros.
+The transform tree is our own, so that it is the same with and without tf2_ros.
 """
 
 from __future__ import annotations
@@ -39,63 +39,65 @@ from msg_utils.stamps import SECOND, to_ns
 
 TF_QOS = QoSProfile(depth=100)
 STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-ODOMETRY_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # takes any
-ALONE = 2.0  # seconds without an odometry, from which on another one may take its place
-NO_TF = "tf2_msgs is not installed, so nothing is known of TF; install ROS 2's tf2_msgs"
+ODOMETRY_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # matches any
+ODOMETRY_TIMEOUT_S = 2.0  # without an odometry, before one in another frame replaces it
+NO_TF = "tf2_msgs is not installed, so TF is not available; install ROS 2's tf2_msgs"
 
 
 def has_tf() -> bool:
-    """Whether TF can be listened to: the wheels of ROS lack its messages."""
+    """Return True if the messages of TF are installed, which the wheels of ROS lack."""
     return importlib.util.find_spec("tf2_msgs") is not None
 
 
 class Transforms:
-    """The frames that a node with the parameters `robot` (base_frame, target_frame, input) asks
-    for. Where TF lacks one the parameters stand, and a diagnostic names the frames."""
+    """The frames that the parameters base_frame, target_frame and input of a node name.
+
+    Where TF lacks a frame, the other parameters stay in force and a diagnostic names the frame.
+    """
 
     def __init__(self, node: Any):
-        self.node, robot = node, node.robot
+        self.node, params = node, node.node_params
         self.tree, self.odometry = TransformTree(), TransformTree()
-        self.base_frame = robot.base_frame.lstrip("/")
-        self.target_frame = getattr(robot, "target_frame", "").lstrip("/")
-        self.carrier = self.odometry_frame = ""  # what the odometry is of, and in which frame
-        self.odometry_ns: int | None = None  # the stamp of the last one
-        self.odometry_came = self.left_out = -inf  # monotonic, when it, or another one, came
-        self.needs: list[Callable[[Any], str | None]] = []  # of a header: what else it waits for
+        self.base_frame = params.base_frame.lstrip("/")
+        self.target_frame = getattr(params, "target_frame", "").lstrip("/")
+        self.carrier = self.odometry_frame = ""  # child frame and frame of the odometry
+        self.odometry_ns: int | None = None  # stamp of the last one
+        self.odometry_arrival = self.ignored_arrival = -inf  # monotonic
+        self.more_needs: list[Callable[[Any], str | None]] = []  # what else a header waits for
         self.sweep: float | None = None  # seconds from the stamp to the last point of a cloud
-        self.lacking: dict[str, str] = {}  # what asked for it -> what is not there
-        self.known: dict[str, Any] = {}  # for the diagnostics
+        self.problem_by_source: dict[str, str] = {}  # problems by the parameter that causes them
+        self.diagnostic_values: dict[str, Any] = {}
         self._last: tuple[tuple[str, int], Placement] = (("", -1), Placement(""))
-        self._met: set[tuple[str, str]] = set()  # frames that have been connected
-        self._listening = self._hearing = False
+        self._connected: set[tuple[str, str]] = set()  # pairs of frames that have been connected
+        self._has_tf_subscription = self._has_odometry_subscription = False
         self._installed = has_tf()
         if self._installed:
             self._subscribe(TF_STATIC, STATIC_QOS, static=True)
-        if self.base_frame or self.target_frame or robot.input.deskew == "tf":
-            self.listen()
+        if self.base_frame or self.target_frame or params.input.deskew == "tf":
+            self.subscribe_to_tf()
             if not self._installed:
-                self.lacking["TF"] = NO_TF
-        if robot.input.deskew == "odometry":
-            self.hear_odometry()
+                self.problem_by_source["TF"] = NO_TF
+        if params.input.deskew == "odometry":
+            self.subscribe_to_odometry()
 
     @property
-    def in_use(self) -> bool:
-        """Whether a cloud's frame matters to the node at all."""
+    def is_used(self) -> bool:
+        """True if a parameter of the node depends on the frame of the clouds."""
         return bool(self.base_frame or self.target_frame
-                    or self.node.robot.input.deskew != "off")
+                    or self.node.node_params.input.deskew != "off")
 
-    def listen(self) -> None:
-        """Subscribe to what moves, too; once."""
-        if self._listening:
+    def subscribe_to_tf(self) -> None:
+        """Subscribe to /tf, in addition to /tf_static, once."""
+        if self._has_tf_subscription:
             return
-        self._listening = True
+        self._has_tf_subscription = True
         if self._installed:
             self._subscribe(TF, TF_QOS, static=False)
 
-    def hear_odometry(self) -> None:
-        """Subscribe to the odometry; once."""
-        if not self._hearing:
-            self._hearing = True
+    def subscribe_to_odometry(self) -> None:
+        """Subscribe to the odometry, once."""
+        if not self._has_odometry_subscription:
+            self._has_odometry_subscription = True
             self.node.input("odometry", ODOMETRY_MESSAGE, self.on_odometry, ODOMETRY_QOS)
 
     def _subscribe(self, topic: str, qos: QoSProfile, static: bool) -> None:
@@ -103,205 +105,235 @@ class Transforms:
                         private=False)
 
     def on_tf(self, msg: Any, static: bool) -> None:
-        """A tf2_msgs/TFMessage; what is no transform in it is left out and named."""
+        """Add a tf2_msgs/TFMessage to the tree. Invalid transforms are skipped and reported."""
         try:
             add_transforms(self.tree, msg, static)
         finally:
-            self._changed()
+            self._clear_cache()
 
     def on_odometry(self, msg: Any) -> None:
-        """A nav_msgs/Odometry: where its child frame is at its stamp. Where several, in frames that
-        differ, share the topic, the first one counts as long as it comes."""
+        """Add a nav_msgs/Odometry. If several with different frames share the topic, the first one
+        is used as long as it arrives."""
         now, child, frame = (monotonic(), msg.child_frame_id.lstrip("/"),
                              msg.header.frame_id.lstrip("/"))
         if (child, frame) != (self.carrier, self.odometry_frame):
-            if now - self.odometry_came < ALONE:
-                self.left_out = now
-                self.lacking["odometry"] = (
+            if now - self.odometry_arrival < ODOMETRY_TIMEOUT_S:
+                self.ignored_arrival = now
+                self.problem_by_source["odometry"] = (
                     f"two odometries on {self.node.resolve_topic_name('~/input/odometry')}: that "
-                    f"of '{child}' in '{frame}' is left out, that of '{self.carrier}' in "
-                    f"'{self.odometry_frame}' is used; give each a topic of its own")
+                    f"of '{child}' in '{frame}' is ignored, that of '{self.carrier}' in "
+                    f"'{self.odometry_frame}' is used; publish them on separate topics")
                 return
             self.odometry = TransformTree()
         add_odometry(self.odometry, msg)
-        if now - self.left_out > ALONE:
-            self.lacking.pop("odometry", None)
-        self.carrier, self.odometry_frame, self.odometry_came = child, frame, now
+        if now - self.ignored_arrival > ODOMETRY_TIMEOUT_S:
+            self.problem_by_source.pop("odometry", None)
+        self.carrier, self.odometry_frame, self.odometry_arrival = child, frame, now
         self.odometry_ns = self.node.counts["last_pose_ns"] = to_ns(msg.header.stamp)
-        self._changed()
+        self._clear_cache()
 
-    def _changed(self) -> None:
+    def _clear_cache(self) -> None:
         self._last = (("", -1), Placement(""))
 
-    # What a cloud needs
+    # Inputs that a cloud needs
 
-    def missing(self, cloud: Any) -> str | None:
-        """What a cloud waits for, as it may still come; None if nothing."""
-        return self._missing_frame(cloud) or next(
-            filter(None, (need(cloud.header) for need in self.needs)), None)
+    def find_missing_input(self, cloud: Any) -> str | None:
+        """Return what a cloud waits for and may still arrive, or None."""
+        return self._find_missing_frame(cloud) or next(
+            filter(None, (need(cloud.header) for need in self.more_needs)), None)
 
-    def _missing_frame(self, cloud: Any) -> str | None:
-        if not self.in_use:
+    def _find_missing_frame(self, cloud: Any) -> str | None:
+        if not self.is_used:
             return None
         frame_id, stamp = cloud.header.frame_id, to_ns(cloud.header.stamp)
         try:
             for frame in filter(None, (self.base_frame, self.target_frame)):
-                self._meet(frame, frame_id, stamp)
-            if self.node.robot.input.deskew != "off":
-                self.sensor_poses(self.node.robot.input.deskew, frame_id,
-                                  np.array([stamp + round(self._sweep_of(cloud) * SECOND)]))
+                self._require_connection(frame, frame_id, stamp)
+            if self.node.node_params.input.deskew != "off":
+                self.sensor_poses(self.node.node_params.input.deskew, frame_id,
+                                  np.array([stamp + round(self._sweep_duration(cloud) * SECOND)]))
         except MissingTransform as error:
             return str(error) if error.late else None
         return None
 
-    def _meet(self, frame: str, frame_id: str, stamp: int) -> None:
-        """Missing where the frames are not connected, which may still come where they never were:
-        a driver may be found before robot_state_publisher."""
+    def _require_connection(self, frame: str, frame_id: str, stamp: int) -> None:
+        """Raise MissingTransform if the frames are not connected.
+
+        The error is marked as late if they never were: a driver may be discovered before
+        robot_state_publisher.
+        """
         try:
             self.tree.lookup(frame, frame_id, stamp)
         except MissingTransform as error:
-            new = (frame, frame_id) not in self._met and "TF" not in self.lacking
-            raise MissingTransform(str(error), error.late or new) from None
-        self._met.add((frame, frame_id))
+            is_new = (frame, frame_id) not in self._connected and "TF" not in self.problem_by_source
+            raise MissingTransform(str(error), error.late or is_new) from None
+        self._connected.add((frame, frame_id))
 
-    def _sweep_of(self, cloud: Any) -> float:
-        """As of the last cloud that was to be moved; before there is one, of this one, which could
-        not wait for the end of its turn otherwise."""
+    def _sweep_duration(self, cloud: Any) -> float:
+        """Return the time from the stamp to the last point of a cloud, in seconds.
+
+        That of the last deskewed cloud, or of this one before there is one.
+        """
         if self.sweep is None:
             try:
                 seconds = read_point_times(cloud, to_frame(cloud)[1]).seconds
-            except InputError:  # corrected() says it
+            except InputError:  # deskew_cloud() reports it
                 return 0.0
             self.sweep = float(seconds[np.isfinite(seconds)].max(initial=0.0))
         return self.sweep
 
     def placing(self, header: Any) -> Placement:
-        """Of a cloud with this header."""
+        """Return the placement of a cloud with this header."""
         key = header.frame_id, to_ns(header.stamp)
-        if not (self.base_frame or self.target_frame or self.node.robot.input.ahead):
+        if not (self.base_frame or self.target_frame or self.node.node_params.input.ahead):
             return Placement(header.frame_id)
         if self._last[0] != key:
             self._last = key, self._placing(*key)
         return self._last[1]
 
     def _placing(self, frame_id: str, stamp_ns: int) -> Placement:
-        base = self._looked_up("base_frame", self.base_frame, frame_id, stamp_ns)
+        base = self._look_up("base_frame", self.base_frame, frame_id, stamp_ns)
         if base is not None and not 0.0 <= base[2, 3] <= 50.0:
-            self.lacking["base_frame"] = (
-                f"'{frame_id}' is {base[2, 3]:.2f} m above '{self.base_frame}', which is to be on "
-                "the ground (as base_footprint is); ground.sensor_pose stands")
+            self.problem_by_source["base_frame"] = (
+                f"'{frame_id}' is {base[2, 3]:.2f} m above '{self.base_frame}', which must be on "
+                "the ground (as base_footprint is); ground.sensor_pose is used")
             base = None
-        ahead = np.radians(self.node.robot.input.ahead)
+        ahead = np.radians(self.node.node_params.input.ahead)
         upright = base
-        if upright is None and ahead:  # the turn comes after the tilt, so both are done here
-            upright = self._by_hand()
+        if upright is None and ahead:  # the turn follows the tilt, so both are applied here
+            upright = self._configured_pose()
             upright = np.eye(4) if upright is None else upright
         level = None if upright is None else find_level_transform(upright, ahead)
-        target = self._looked_up("target_frame", self.target_frame, frame_id, stamp_ns)
+        target = self._look_up("target_frame", self.target_frame, frame_id, stamp_ns)
         if target is None:
             return Placement(frame_id, base, level, None if level is None else invert_pose(level))
         return Placement(self.target_frame, base, level,
                          target if level is None else target @ invert_pose(level))
 
-    def _looked_up(self, what: str, frame: str, frame_id: str, stamp_ns: int) -> np.ndarray | None:
-        """The pose of frame_id in the frame that the parameter `what` names; None where there is
-        none, which problems() then says."""
-        self.lacking.pop(what, None)
+    def _look_up(self, what: str, frame: str, frame_id: str, stamp_ns: int) -> np.ndarray | None:
+        """Return the pose of frame_id in the frame that the parameter `what` names, or None.
+
+        A missing transform is reported by problems().
+        """
+        self.problem_by_source.pop(what, None)
         if not frame:
             return None
         try:
             return self.tree.lookup(frame, frame_id, stamp_ns)
         except MissingTransform as error:
-            instead = {"base_frame": "ground.sensor_pose stands",
-                       "target_frame": f"results are in '{frame_id}'"}[what]
-            self.lacking[what] = f"{what} '{frame}': {error}; {instead}"
+            fallback = {"base_frame": "ground.sensor_pose is used",
+                        "target_frame": f"results are in '{frame_id}'"}[what]
+            self.problem_by_source[what] = f"{what} '{frame}': {error}; {fallback}"
             return None
 
-    def mounted(self, params: Any, placing: Placement) -> Any:
-        """params, a node's, for a frame that placing has levelled; its params.ground.sensor_pose
-        stands where TF has no base_frame."""
+    def with_mounting(self, params: Any, placing: Placement) -> Any:
+        """Return the parameters of a node for a frame that placing has levelled.
+
+        The sensor height comes from TF, or from params.ground.sensor_pose without a base_frame.
+        """
         height = params.ground.sensor_pose.height
         if placing.base is not None:
             height = float(placing.base[2, 3])
-            self.known["mount"] = f"{height:.3f} m above '{self.base_frame}'"
+            self.diagnostic_values["mount"] = f"{height:.3f} m above '{self.base_frame}'"
         if placing.base is not None or placing.level is not None:
             params = replace(params, ground=replace(
                 params.ground, sensor_pose=SensorPoseParams(height=height)))
         return params
 
-    def cropped(self, frame: LidarFrame, crop: CropParams, placing: Placement
-                ) -> tuple[np.ndarray, LidarFrame]:
-        """As robot.crop.cropped. A body in a base_frame that TF does not have is not cropped, as
-        it could be anything."""
-        self.lacking.pop("crop.body", None)
+    def crop_frame(self, frame: LidarFrame, crop: CropParams, placing: Placement
+                   ) -> tuple[np.ndarray, LidarFrame]:
+        """Crop a frame, see robot.crop.crop_frame.
+
+        The body of the robot is not cropped while base_frame has no transform.
+        """
+        self.problem_by_source.pop("crop.body", None)
         if crop.body and self.base_frame:
             if placing.base is None:
-                self.lacking["crop.body"] = "crop.body is not left out, as base_frame is not known"
+                self.problem_by_source["crop.body"] = (
+                    "crop.body is not cropped: the pose in base_frame is unknown")
                 crop = replace(crop, body=())
             elif crop.body[5] <= 0.0:
-                self.lacking["crop.body"] = (
+                self.problem_by_source["crop.body"] = (
                     f"crop.body ends {-crop.body[5]:.2f} m below the ground of '{self.base_frame}'"
-                    ", in which it is read; give it in that frame, as a file of setup has it too")
-        level, pose = placing.level, None if placing.base is not None else self._by_hand()
+                    "; give it in that frame, as the file of `setup` does")
+        level, pose = placing.level, None if placing.base is not None else self._configured_pose()
         if level is None and pose is not None:
             level = find_level_transform(pose)
         return crop_frame(frame, crop, placing.base, level)
 
     def to_level(self, header: Any, frame_id: str) -> np.ndarray:
-        """(4, 4): takes points of a frame to the level frame of a cloud with this header. Missing
-        where TF does not connect them."""
+        """Return the (4, 4) transform from a frame to the level frame of a cloud.
+
+        Raises:
+            MissingTransform: TF does not connect the frames.
+        """
         if frame_id not in ("", header.frame_id):
-            self.listen()
+            self.subscribe_to_tf()
         pose = self.tree.lookup(header.frame_id, frame_id or header.frame_id, to_ns(header.stamp))
         level = self.placing(header).level
         return pose if level is None else level @ pose
 
-    # How the sensor moves
+    # Motion of the sensor
 
     def sensor_poses(self, source: str, frame_id: str, at: np.ndarray,
                      max_gap: float | None = None) -> np.ndarray:
-        """(M, 4, 4): the poses of a frame of the robot at times (M,) ns, in one that does not
-        move: by the source odometry or tf, the latter in input.fixed_frame. max_gap as in
-        TransformTree.lookup_many. Missing where they are not known."""
+        """Return the poses of a frame of the robot in a fixed frame.
+
+        Args:
+            source: "odometry", or "tf" for poses in input.fixed_frame.
+            frame_id: frame of the robot.
+            at: (M,) times in ns.
+            max_gap: see TransformTree.lookup_many.
+
+        Returns:
+            (M, 4, 4) poses.
+
+        Raises:
+            MissingTransform: the poses are not available.
+        """
         if source == "tf":
-            return self.tree.lookup_many(self.node.robot.input.fixed_frame, frame_id, at, max_gap)
+            fixed_frame = self.node.node_params.input.fixed_frame
+            return self.tree.lookup_many(fixed_frame, frame_id, at, max_gap)
         if frame_id.lstrip("/") == self.odometry_frame != "":  # it does not move
             return np.tile(np.eye(4), (len(at), 1, 1))
         return self.odometry_poses(at, max_gap) @ self._on_carrier(frame_id, at, max_gap)
 
     def odometry_poses(self, at: np.ndarray, max_gap: float | None = None) -> np.ndarray:
-        """(M, 4, 4): the poses at times (M,) ns of what the odometry is of. Missing as above."""
+        """Return the (M, 4, 4) poses of the child frame of the odometry at times (M,) ns.
+
+        Raises:
+            MissingTransform: they are not available.
+        """
         if self.odometry_ns is None:
             topic = self.node.resolve_topic_name("~/input/odometry")
-            raise MissingTransform(f"nothing has come on {topic}; remap it to the odometry's topic")
+            raise MissingTransform(f"no odometry on {topic}; remap it to the topic of the odometry")
         try:
             return self.odometry.lookup_many(FIXED, MOVING, at, max_gap)
         except MissingTransform as error:
-            said = str(error).replace(FIXED, self.odometry_frame).replace(MOVING, self.carrier)
-            raise MissingTransform(f"{self.node.resolve_topic_name('~/input/odometry')}: {said}",
+            reason = str(error).replace(FIXED, self.odometry_frame).replace(MOVING, self.carrier)
+            raise MissingTransform(f"{self.node.resolve_topic_name('~/input/odometry')}: {reason}",
                                    error.late) from None
 
     def _on_carrier(self, frame_id: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
-        """(M or 1, 4, 4): where on what the odometry is of a frame is at times (M,) ns."""
+        """Return the (M or 1, 4, 4) poses of a frame in the child frame of the odometry."""
         if frame_id.lstrip("/") == self.carrier:
             return np.eye(4)[None]
         if not self.carrier:
             topic = self.node.resolve_topic_name("~/input/odometry")
-            raise MissingTransform(f"the odometry on {topic} says in no child_frame_id what it is "
-                                   "of; set it where it is made")
+            raise MissingTransform(f"the odometry on {topic} has an empty child_frame_id; "
+                                   "set it in the publisher")
         try:
             return self.tree.lookup_many(self.carrier, frame_id, at, max_gap)
         except MissingTransform as error:
-            self.listen()
-            pose = self._by_hand() if self.carrier == self.base_frame else None
+            self.subscribe_to_tf()
+            pose = self._configured_pose() if self.carrier == self.base_frame else None
             if pose is None:
                 raise MissingTransform(f"the odometry is of '{self.carrier}': {error}",
                                        error.late) from None
             return pose[None]
 
-    def carries(self, frame_id: str) -> bool:
-        """Whether it is known how a frame moves with the odometry: it is that of the odometry, or
-        TF connects them."""
+    def knows_motion_of(self, frame_id: str) -> bool:
+        """Return True if a frame is one of the odometry, or TF connects it with its child frame."""
         if frame_id.lstrip("/") in (self.carrier, self.odometry_frame):
             return True
         try:
@@ -310,54 +342,56 @@ class Transforms:
             return error.late
         return True
 
-    def _by_hand(self) -> np.ndarray | None:
-        """The sensor's pose above the ground as the parameters have it."""
+    def _configured_pose(self) -> np.ndarray | None:
+        """Return the pose of the sensor above the ground from the parameters, or None."""
         ground = getattr(self.node.params, "ground", None)
         pose = ground and ground.sensor_pose
         return None if pose is None else make_tilted_pose(pose.roll, pose.pitch, pose.height)
 
-    def corrected(self, msg: Any) -> Any:
-        """The cloud with its points moved to its stamp; the cloud itself, counted, where what is
-        needed for that is not there. What the crop takes for the robot's own body stays, as it
-        moves along."""
-        if self.node.robot.input.deskew == "off":
+    def deskew_cloud(self, msg: Any) -> Any:
+        """Return the cloud with its points motion-compensated to its stamp.
+
+        Points in the crop's body of the robot are not moved, as they move with the sensor. Without
+        poses or times of points, the cloud itself is returned and counted as not deskewed.
+        """
+        if self.node.node_params.input.deskew == "off":
             return msg
         begin, counts = perf_counter(), self.node.counts
-        self.lacking.pop("deskew", None)
+        self.problem_by_source.pop("deskew", None)
         try:
             moved = self._moved(msg)
         except InputError as error:
-            self.lacking["deskew"] = f"input.deskew: {error}; clouds are used as they are"
+            self.problem_by_source["deskew"] = f"input.deskew: {error}; clouds are not deskewed"
             counts["not_deskewed"] = counts.get("not_deskewed", 0) + 1
             return msg
         counts["deskewed"] = counts.get("deskewed", 0) + 1
-        self.known["deskew_ms"] = f"{(perf_counter() - begin) * 1e3:.1f}"
+        self.diagnostic_values["deskew_ms"] = f"{(perf_counter() - begin) * 1e3:.1f}"
         return moved
 
     def _moved(self, msg: Any) -> Any:
         frame, indices = to_frame(msg)
         crop = getattr(self.node.params, "crop", None)
         if crop is not None and crop.enabled:
-            kept, frame = self.cropped(frame, crop, self.placing(msg.header))
+            kept, frame = self.crop_frame(frame, crop, self.placing(msg.header))
             indices = indices.take(kept)
 
         def poses(at: np.ndarray) -> np.ndarray:
-            # Also where they are not known yet: the next cloud then waits for the end of its turn.
+            # Set before the lookup: after a failure, the next cloud waits for the end of its sweep.
             self.sweep = float(at.max() - frame.stamp_ns) / SECOND
-            return self.sensor_poses(self.node.robot.input.deskew, frame.frame_id, at)
+            return self.sensor_poses(self.node.node_params.input.deskew, frame.frame_id, at)
 
-        found = deskew_points(msg, frame, indices, poses)
-        if found is None:
+        result = deskew_points(msg, frame, indices, poses)
+        if result is None:
             return msg
-        known, moved, times = found
-        return replace_points(msg, bag_message, indices.take(known), moved, times)
+        timed, moved, times = result
+        return replace_points(msg, bag_message, indices.take(timed), moved, times)
 
-    # For the diagnostics
+    # Diagnostics
 
     def values(self) -> dict[str, Any]:
-        """What is known."""
-        return self.known
+        """Return the values for the diagnostics."""
+        return self.diagnostic_values
 
     def problems(self) -> list[Problem]:
-        """What is asked for and not there, each with what stands instead."""
-        return [(kind, WARN, message) for kind, message in self.lacking.items()]
+        """Return what the parameters need but is missing, each with its fallback."""
+        return [(kind, WARN, message) for kind, message in self.problem_by_source.items()]

@@ -18,10 +18,10 @@ def domain() -> Iterator[int]:
     """A ROS domain that nobody else uses, reached by this machine only. It is in the environment,
     so that whatever the tests start is on it too."""
     from lidar_perception.candidates.warm_up import warm_up
-    from lidar_perception.nodes.graph import private_domain
+    from lidar_perception.nodes.graph import reserve_domain
     from lidar_perception.nodes.shared_memory import use_large_shared_memory
     with pytest.MonkeyPatch.context() as patch:
-        number = private_domain()
+        number = reserve_domain()
         patch.setenv("ROS_DOMAIN_ID", str(number))
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         use_large_shared_memory()

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lidar_perception.candidates.warm_up import warm_up
-from lidar_perception.nodes.graph import private_domain
+from lidar_perception.nodes.graph import reserve_domain
 from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.types import InputError
 
@@ -49,7 +49,7 @@ def description(*actions: Any) -> Any:
         from launch_testing.actions import ReadyToTest
     except ModuleNotFoundError as error:
         raise _missing(error) from None
-    os.environ.update(ROS_DOMAIN_ID=str(private_domain()),
+    os.environ.update(ROS_DOMAIN_ID=str(reserve_domain()),
                       ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
     use_large_shared_memory()
     warm_up()  # what nodes compile is cached then; on a fresh machine that can outlast a wait

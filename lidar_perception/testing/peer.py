@@ -9,9 +9,9 @@ from typing import Any
 
 from rcl_interfaces.srv import GetParameters, SetParameters
 
-from lidar_perception.nodes.graph import Graph, outputs_in_use
+from lidar_perception.nodes.external_node import ExternalNode, to_parameters, to_values
+from lidar_perception.nodes.graph import Graph, find_connected_outputs
 from lidar_perception.nodes.runtime import RELIABLE, QoSProfile
-from lidar_perception.nodes.watch import Outside, parameters_of, values_of
 from lidar_perception.testing.processes import NodesUnderTest
 from lidar_perception.wire.codec import decode, encode, load_typestore
 from msg_utils.messages import message_class
@@ -22,7 +22,7 @@ TIMEOUT = 120.0  # seconds; the first start on a machine compiles, and it may ha
 LEVELS = {0: "OK", 1: "WARN", 2: "ERROR", 3: "STALE"}
 
 
-class Peer(Outside):
+class Peer(ExternalNode):
     """Talks over DDS on a domain (None: that of the environment); a context manager. Each wait ends
     with an AssertionError that says what was seen instead: after its time limit, or at once where
     one of `processes` has ended with an error.
@@ -85,7 +85,7 @@ class Peer(Outside):
             met = bool(condition())
             return met or bool(self._failed())
 
-        self.until(over, timeout)
+        self.spin_until(over, timeout)
         if met or (self._failed() and condition()):  # it may have been the end that was waited for
             return
         what = what if isinstance(what, str) else what()
@@ -130,8 +130,8 @@ class Peer(Outside):
 
     def wait_for_graph(self, graph: Graph, timeout: float = TIMEOUT) -> None:
         """Until all nodes of a graph, as start_graph() returns it, are up and connected."""
-        outputs = outputs_in_use(graph)
-        self.wait(lambda: self.connected(outputs), f"{', '.join(graph)} to find each other",
+        outputs = find_connected_outputs(graph)
+        self.wait(lambda: self.is_connected(outputs), f"{', '.join(graph)} to find each other",
                   timeout)
 
     def wait_for_subscribers(self, node: str, topic: str, others: int = 0,
@@ -140,7 +140,7 @@ class Peer(Outside):
         its topic, and so many others: what it publishes before, these do not get."""
         name = self.node.resolve_topic_name(topic)
         wanted = others + sum(name == heard for heard, _ in self.heard)
-        self.wait(lambda: int(self.value_of(node, f"subscribers of {name}") or 0) >= wanted,
+        self.wait(lambda: int(self.get_value(node, f"subscribers of {name}") or 0) >= wanted,
                   f"{wanted} subscribers of {name}", timeout)
 
     def seen(self) -> str:
@@ -164,7 +164,7 @@ class Peer(Outside):
     def change(self, node: str, values: Mapping[str, Any]) -> list[str]:
         """Set parameters of a node, each by itself; its reasons where it refuses."""
         request = SetParameters.Request(
-            parameters=[parameter.to_parameter_msg() for parameter in parameters_of(values)])
+            parameters=[parameter.to_parameter_msg() for parameter in to_parameters(values)])
         results = self.call(f"{node}/set_parameters", SetParameters, request).results
         return [r.reason or "no reason is given" for r in results if not r.successful]
 
@@ -176,7 +176,7 @@ class Peer(Outside):
     def parameters(self, node: str, values: Mapping[str, Any]) -> Iterator[None]:
         """Other parameters for a while; those from before come back at the end."""
         request = GetParameters.Request(names=list(values))
-        before = values_of(self.call(f"{node}/get_parameters", GetParameters, request).values)
+        before = to_values(self.call(f"{node}/get_parameters", GetParameters, request).values)
         assert not (refused := self.change(node, values)), refused
         try:
             yield

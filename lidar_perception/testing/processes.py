@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lidar_perception.nodes.graph import CLOUDS, Graph, Processes, graph_of, relative
+from lidar_perception.nodes.graph import CLOUDS, Graph, Processes, build_graph, relative_name
 from lidar_perception.param_fields import flatten
 from lidar_perception.testing.forking import Forked
 from lidar_perception.wire.topics import POINTS
@@ -40,7 +40,7 @@ class NodesUnderTest(Processes):
             self.running[name] = Forked(arguments, self.environment, self.logs / f"{name}.log")
 
     def start_graph(self, detectors: Sequence[str], params: Any = None, *, single: bool = False,
-                    points: str = relative(POINTS), namespace: str = "") -> Graph:
+                    points: str = relative_name(POINTS), namespace: str = "") -> Graph:
         """Start the nodes of one or several of candidates, pointpillars and pointnet, as the launch
         files do: ground and clusters once for all, or with single one process a detector. params: a
         dataclass of parameters, or NAME: value, for all nodes that have a parameter of that name;
@@ -49,7 +49,7 @@ class NodesUnderTest(Processes):
         values = {} if params is None else (
             params if isinstance(params, Mapping) else flatten(params))
         own = {node: {a: points if b == CLOUDS["~/input/points"] else b for a, b in remap.items()}
-               for node, remap in graph_of(detectors, single).items()}
+               for node, remap in build_graph(detectors, single).items()}
         for node, remap in own.items():
             self.start(node, remap, values, namespace)
         return own

@@ -102,12 +102,12 @@ def view(data: Path | None, live: bool, detectors: tuple[DetectorChoice, ...],
 def _listening(namespace: str, points: str, detections: tuple[str, ...]) -> Iterator[Served]:
     """What the page shows of the running graph, while the block lasts."""
     from lidar_perception.nodes import require_rclpy
-    from lidar_perception.nodes.shared_memory import fed_by_a_driver, use_large_shared_memory
+    from lidar_perception.nodes.shared_memory import is_fed_by_driver, use_large_shared_memory
     from lidar_studio.live import Live
     from lidar_studio.served import Served
 
     require_rclpy()
-    use_large_shared_memory(points != "" and fed_by_a_driver([points]))
+    use_large_shared_memory(points != "" and is_fed_by_driver([points]))
     from lidar_studio.live_view import listening  # with the profile already set
     name = "/".join(filter(None, (f"ROS domain {os.environ.get('ROS_DOMAIN_ID') or 0}",
                                   namespace.strip("/"))))

@@ -14,10 +14,10 @@ from fuzz.case import FAILED, REFUSED, SURVIVED, Outcome
 from fuzz.valid_messages import CLOUD, valid_message
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes import load_node_class
-from lidar_perception.nodes.graph import private_domain
+from lidar_perception.nodes.external_node import Context, create_context, to_parameters
+from lidar_perception.nodes.graph import reserve_domain
 from lidar_perception.nodes.reception import Reception
 from lidar_perception.nodes.runtime import ERROR, MARKERS, OK
-from lidar_perception.nodes.watch import Context, new_context, parameters_of
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode
 from lidar_perception.wire.transforms import ODOMETRY_MESSAGE
@@ -75,7 +75,7 @@ class Nodes:
             os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
             set_logger_level("", LoggingSeverity.FATAL)
             warm_up()
-            context = new_context(private_domain())
+            context = create_context(reserve_domain())
             nodes = {name: FedNode(name, context) for name in INPUTS}
         self.nodes = nodes
 
@@ -86,7 +86,7 @@ class FedNode:
     def __init__(self, name: str, context: Context, **values: Any):
         self.node = load_node_class(name)(
             context=context, enable_rosout=False, start_parameter_services=False,
-            parameter_overrides=parameters_of(values))
+            parameter_overrides=to_parameters(values))
         self.node.start()
         self.inputs = INPUTS[name][1]
         self.calls = {s.topic_name.removeprefix(f"/{name}").lstrip("/"): s.callback
@@ -104,7 +104,7 @@ class FedNode:
         """Deliver valid messages to the other inputs, then data, and with then_valid valid messages
         again, which must be served."""
         if params != self.params:
-            results = self.node.set_parameters(parameters_of(params))
+            results = self.node.set_parameters(to_parameters(params))
             assert all(result.successful for result in results), results
             self.params = params
         for other in self.inputs:

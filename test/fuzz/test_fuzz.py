@@ -21,7 +21,7 @@ from fuzz.nodes import INPUTS, FedNode
 from fuzz.valid_messages import CLOUD, cloud, mutated, valid_message
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.nodes import NODES
-from lidar_perception.nodes.watch import leave, new_context
+from lidar_perception.nodes.external_node import create_context, shut_down_context
 from lidar_perception.wire.codec import bag_message, encode
 from msg_utils.point_cloud2 import add_columns, to_array
 
@@ -34,7 +34,7 @@ WITH_CLOUDS = [name for name, (_, inputs, _) in INPUTS.items() if "input/points"
 @pytest.fixture(scope="module")
 def nodes(domain, tmp_path_factory):
     """Return every node by its name, with small networks."""
-    context, folder = new_context(domain), tmp_path_factory.mktemp("weights")
+    context, folder = create_context(domain), tmp_path_factory.mktemp("weights")
     pillars, clusters = str(folder / "v4.safetensors"), str(folder / "pointnet.safetensors")
     config = tiny("v4", low=(0.0, -10.24, -3.0), high=(20.48, 10.24, 1.0))
     save_checkpoint(pillars, lively(config), Header(config))
@@ -45,7 +45,7 @@ def nodes(domain, tmp_path_factory):
               "fused_detector": {"fused.weights": pillars, "fused.classifier": clusters}}
     made = {name: FedNode(name, context, **values.get(name, {})) for name in INPUTS}
     yield made
-    leave(context, *(each.node for each in made.values()))
+    shut_down_context(context, *(each.node for each in made.values()))
 
 
 def test_every_input_of_a_node_is_fuzzed(nodes):

@@ -42,13 +42,13 @@ class TestDriver(unittest.TestCase):
                                   env=environment, stdin=subprocess.PIPE, text=True)
         with Peer() as peer:
             def value(key):
-                return int(peer.value_of("perception", key) or 0)
+                return int(peer.get_value("perception", key) or 0)
 
             found = peer.listen("/perception/output/detections",
                                 "visualization_msgs/msg/MarkerArray")
             peer.wait(lambda: found and value("frames") + value("dropped") == COUNT, "every cloud")
             assert value("lost") == 0
-            assert peer.value_of("perception", "reliability") == "reliable"
+            assert peer.get_value("perception", "reliability") == "reliable"
         driver.communicate("\n", timeout=20)
         assert driver.returncode == 0
 

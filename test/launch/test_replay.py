@@ -19,7 +19,7 @@ pytest.importorskip("launch_ros", reason="needs launch_ros, which comes with ROS
 import launch_testing
 import launch_testing.asserts
 
-from lidar_perception.nodes.graph import STAGES, result_topics
+from lidar_perception.nodes.graph import STAGES, list_result_topics
 from lidar_perception.simulation.scene import CROWDED
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.testing.bags import bag_of
@@ -41,7 +41,7 @@ class TestReplay(unittest.TestCase):
     def test_candidates_arrive(self):
         """The bag is played in a loop."""
         with Peer() as peer:
-            heard = peer.wait_for_messages(result_topics()["final"],
+            heard = peer.wait_for_messages(list_result_topics()["final"],
                                            "visualization_msgs/msg/MarkerArray", 2 * FRAMES)
         assert any(len(objects_of(message).boxes) for message in heard)
 

@@ -51,8 +51,8 @@ def start(domain):
     """Makes a node in this process; what it publishes grows in node.sent, by topic."""
     from rclpy.parameter import Parameter
 
-    from lidar_perception.nodes.watch import leave, new_context
-    context, nodes = new_context(domain), []
+    from lidar_perception.nodes.external_node import create_context, shut_down_context
+    context, nodes = create_context(domain), []
 
     def make(kind, **values):
         overrides = [Parameter(k, value=list(v) if isinstance(v, tuple) else v)
@@ -68,4 +68,4 @@ def start(domain):
         return node
 
     yield make
-    leave(context, *nodes)
+    shut_down_context(context, *nodes)

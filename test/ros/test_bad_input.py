@@ -104,7 +104,7 @@ def serve(send, results):
 def test_bad_clouds_become_diagnostics_and_the_node_lives_on(node, send, serve, peer, good_cloud):
     for name, (msg, words) in BAD.items():
         peer.diagnostics.clear()
-        send(node, msg, lambda w=words: w in peer.message_of(node), f"'{words}': {name}")
+        send(node, msg, lambda w=words: w in peer.get_message(node), f"'{words}': {name}")
     result = serve(node, good_cloud)
     assert result.width == good_cloud.width
     names = [f.name for f in result.fields]
@@ -144,7 +144,7 @@ def test_no_method_dies_of_a_strange_cloud(values, send, serve, results, shared_
 def test_a_wrong_height_and_a_wrong_scale_of_intensity_are_said(send, peer, good_cloud):
     """The sensor hangs 1.73 m high; intensity is 0..1."""
     def said(words):
-        send(node, good_cloud, lambda: words in peer.message_of(node), words)
+        send(node, good_cloud, lambda: words in peer.get_message(node), words)
 
     node = "ground_segmentation"
     with peer.parameters(f"/{node}", {"ground.method": "patchwork",
@@ -154,9 +154,9 @@ def test_a_wrong_height_and_a_wrong_scale_of_intensity_are_said(send, peer, good
                                           "input.intensity_max": 0.001}):
             said("input.intensity_max")
     said("segmenting")
-    assert peer.message_of(node) == "segmenting"
-    assert abs(float(peer.value_of(node, "sensor_height")) - 1.73) < 0.1
-    assert 0.5 < float(peer.value_of(node, "plane_inlier_share")) <= 1.0
+    assert peer.get_message(node) == "segmenting"
+    assert abs(float(peer.get_value(node, "sensor_height")) - 1.73) < 0.1
+    assert 0.5 < float(peer.get_value(node, "plane_inlier_share")) <= 1.0
 
 
 def test_layout_does_not_change_the_result(serve, good_cloud):
@@ -177,7 +177,7 @@ def test_layout_does_not_change_the_result(serve, good_cloud):
 
 def test_clustering_and_refinement_name_the_missing_column(send, peer, good_cloud):
     for node, name in ("clustering", "ground"), ("candidate_refinement", "cluster_id"):
-        send(node, good_cloud, lambda n=node, w=name: f"no column '{w}'" in peer.message_of(n),
+        send(node, good_cloud, lambda n=node, w=name: f"no column '{w}'" in peer.get_message(n),
              f"a diagnostic of {node}")
 
 
@@ -185,7 +185,7 @@ def test_without_camera_and_seed_the_diagnostics_say_so_and_a_click_helps(
         send, peer, good_cloud, drive_bag):
     """view.enabled without CameraInfo; then without a seed; then with a clicked pedestrian."""
     def said(words):
-        send("perception", good_cloud, lambda: words in peer.message_of("perception"), words)
+        send("perception", good_cloud, lambda: words in peer.get_message("perception"), words)
 
     with peer.parameters("/perception", {"seed.source": "click"}):
         with peer.parameters("/perception", {"view.enabled": True, "input.max_wait": 0.5}):

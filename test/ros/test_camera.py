@@ -51,21 +51,21 @@ def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, qos, proc
     truth, cloud = peer.talker(TRUTH, MARKERS), peer.talker(POINTS, CLOUD)
     peer.wait_for_graph(graph)
     peer.send(cloud, sent[POINTS], lambda: "waits for the camera's calibration"
-              in peer.message_of(first), "the reason why it waits")
+              in peer.get_message(first), "the reason why it waits")
     assert not found
     assert len(camera) == 2
-    for topic, over in ((CAMERA_INFO, "no CameraInfo has come"),
+    for topic, over in ((CAMERA_INFO, "no CameraInfo on"),
                         (EXTRINSICS, "waits for the camera")):
         assert not found
         talker = peer.talker(topic, types[topic], qos)
         if qos is LATCHED:
             talker.publish(encode(camera[topic]))
         else:
-            assert over in peer.message_of(first)
-            peer.send(talker, camera[topic], lambda w=over: w not in peer.message_of(first),
+            assert over in peer.get_message(first)
+            peer.send(talker, camera[topic], lambda w=over: w not in peer.get_message(first),
                       f"an end of '{over}'")
     peer.send(truth, sent[TRUTH], lambda: found, "the detections")
     received = to_detections(from_marker_array(found[-1]))
     np.testing.assert_array_equal(received.boxes, expected.boxes)
     np.testing.assert_array_equal(received.scores, expected.scores)
-    peer.wait(lambda: peer.message_of(first) in ("detecting", "segmenting"), "a good state")
+    peer.wait(lambda: peer.get_message(first) in ("detecting", "segmenting"), "a good state")

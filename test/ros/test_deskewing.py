@@ -50,7 +50,7 @@ def test_a_cloud_of_a_moving_sensor_is_moved_to_its_stamp(start, source):
     as_it_is = decode(node.sent["points"][-1], "sensor_msgs/msg/PointCloud2")
     np.testing.assert_array_equal(to_array(as_it_is)["x"], raw[:, 0])
     assert node.counts["not_deskewed"] == 1
-    assert "clouds are used as they are" in problems(node)
+    assert "clouds are not deskewed" in problems(node)
 
     for i in range(-5, 16):
         stamp = START + i * PERIOD // 10

@@ -11,7 +11,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from tracking_samples import START, TENTH, crowd
 
-from lidar_perception.nodes.replay.evaluator import WAITING_FRAMES, Evaluator
+from lidar_perception.nodes.replay.evaluator import MAX_INCOMPLETE_FRAMES, Evaluator
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_detection_markers
@@ -27,7 +27,7 @@ def said(node):
     return " ".join(message for _, _, message in node.problems())
 
 
-@pytest.mark.parametrize("late", [0, WAITING_FRAMES - 1, WAITING_FRAMES + 30])
+@pytest.mark.parametrize("late", [0, MAX_INCOMPLETE_FRAMES - 1, MAX_INCOMPLETE_FRAMES + 30])
 def test_labels_may_be_late_and_each_frame_that_is_given_up_is_counted_once(start, late):
     node, count = start(Evaluator), 300
     for i in range(count + late):
@@ -35,7 +35,7 @@ def test_labels_may_be_late_and_each_frame_that_is_given_up_is_counted_once(star
             node._add("final", array(i))
         if i >= late:
             node._add("ground_truth", array(i - late))
-    given_up = count - WAITING_FRAMES if late > WAITING_FRAMES else 0
+    given_up = count - MAX_INCOMPLETE_FRAMES if late > MAX_INCOMPLETE_FRAMES else 0
     assert node.counts["frames"] == count - given_up
     assert node.counts["incomplete"] + len(node.waiting) == given_up
 
@@ -43,9 +43,9 @@ def test_labels_may_be_late_and_each_frame_that_is_given_up_is_counted_once(star
 def test_all_detections_before_all_labels_leave_those_that_wait(start):
     node = start(Evaluator)
     for name in "final", "ground_truth":
-        for i in range(WAITING_FRAMES + 30):
+        for i in range(MAX_INCOMPLETE_FRAMES + 30):
             node._add(name, array(i))
-    assert node.counts["frames"] == WAITING_FRAMES and node.counts["incomplete"] == 30
+    assert node.counts["frames"] == MAX_INCOMPLETE_FRAMES and node.counts["incomplete"] == 30
     assert not node.waiting and node.counts["repeated"] == 30
     assert "nothing on /evaluator/input/ground_truth with their" in node.state[1] or (
         node.state[1] == "scoring")
@@ -53,13 +53,13 @@ def test_all_detections_before_all_labels_leave_those_that_wait(start):
 
 def test_a_file_that_cannot_be_written_is_said_and_tried_again(start, tmp_path):
     folder = tmp_path / "scores"
-    with pytest.raises(InputError, match="name a file in a folder"):
+    with pytest.raises(InputError, match="give the path of a file"):
         start(Evaluator, file=str(tmp_path))
     node = start(Evaluator, file=str(folder / "scores.json"))
-    node._time("detector", float("nan"))
+    node._add_time("detector", float("nan"))
     folder.write_text("a file where the folder should be")
     node.write()
-    assert "cannot write" in said(node) and "tried again" in said(node)
+    assert "cannot write" in said(node) and "retrying" in said(node)
     with pytest.raises(InputError, match="the scores are lost"):
         node.close()
     folder.unlink()
@@ -79,8 +79,9 @@ def test_boxes_of_other_frames_are_scored_and_said(start):
 
 
 @pytest.mark.parametrize("values, words", [
-    ({"stages": ["ground_truth"]}, "must be names"), ({"stages": ["a", "a"]}, "each once"),
-    ({"timing": ["foo"]}, "no .../NODE/debug/WHAT")])
+    ({"stages": ["ground_truth"]}, "must be distinct names"),
+    ({"stages": ["a", "a"]}, "must be distinct names"),
+    ({"timing": ["foo"]}, "not of the form")])
 def test_parameters_with_which_nothing_is_scored_are_refused(start, values, words):
     with pytest.raises(InputError, match=words):
         start(Evaluator, **values)

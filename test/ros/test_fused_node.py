@@ -17,7 +17,7 @@ from lidar_perception.detectors.fused.detector import load_fused_detector
 from lidar_perception.detectors.fused.fusion import package_models, write_fusion
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams
 from lidar_perception.nodes.fused_detector import FusedNode
-from lidar_perception.nodes.graph import graph_of
+from lidar_perception.nodes.graph import build_graph
 from lidar_perception.param_fields import with_values
 from msg_utils.markers import from_marker_array
 
@@ -25,7 +25,7 @@ NODE = "fused_detector"
 FILE = Path(__file__).resolve().parents[2] / "config" / "fused.param.yaml"
 EAGER = with_values(FusedDetectorParams(), {"fused.range": "around", **{
     f"fused.scores.{name}": 0.0 for name in ("car", "pedestrian", "cyclist", "other")}})
-DETECTOR = DetectorUnderTest(NODE, graph_of(["fused"], single=True), FILE, EAGER,
+DETECTOR = DetectorUnderTest(NODE, build_graph(["fused"], single=True), FILE, EAGER,
                              load_fused_detector)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -59,7 +59,7 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, sh
     assert_equal(received(found, 2), other)
     assert not np.array_equal(other.scores, DETECTOR.offline(weights, message(2)).scores)
     shared_peer.wait(lambda: all(times.values()), "the times of the steps")
-    assert "PointNet" in shared_peer.value_of(NODE, "network")
+    assert "PointNet" in shared_peer.get_value(NODE, "network")
 
 
 def test_no_cloud_ends_the_detector(talker, found, shared_processes, shared_peer, weights):
@@ -68,7 +68,7 @@ def test_no_cloud_ends_the_detector(talker, found, shared_processes, shared_peer
                "all is ground": (message(1, ground=np.ones(len(frame()), "u1")), "is ground")}
     for name, (msg, words) in strange.items():
         shared_peer.diagnostics.clear()
-        shared_peer.send(talker, msg, lambda w=words: w in shared_peer.message_of(NODE),
+        shared_peer.send(talker, msg, lambda w=words: w in shared_peer.get_message(NODE),
                          f"'{words}': {name}")
     shared_peer.send(talker, message(7), lambda: received(found, 7), "detections of a good cloud")
     assert_equal(received(found, 7), DETECTOR.offline(weights, message(7)))

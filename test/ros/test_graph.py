@@ -13,7 +13,7 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
-from lidar_perception.nodes.graph import cloud_topic, result_topics
+from lidar_perception.nodes.graph import cloud_topic, list_result_topics
 from lidar_perception.nodes.replay.graph_replay import replay
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.report import (
@@ -77,7 +77,7 @@ def test_no_frame_is_lost_between_the_processes(run):
 
 def test_candidates_over_dds_are_those_of_the_offline_path(run, offline):
     single, _, out = run
-    for stage, topic in result_topics(single).items():
+    for stage, topic in list_result_topics(single).items():
         with Bag(out / "result") as bag:
             messages = [from_marker_array(m) for _, _, m in bag.messages({topic})]
         received = {m.stamp_ns: to_detections(m) for m in messages}

@@ -81,7 +81,7 @@ def test_recorder_completes_its_bag(number, processes, peer, tmp_path):
     process, _ = start(processes, "ros2 run", "bag_recorder", "--ros-args", "-p", f"bag:={bag}",
                        "-p", "topics:=[/note]")
     peer.send(peer.talker("/note", NOTE), note,
-              lambda: int(peer.value_of("bag_recorder", "frames") or 0) > 1, "two notes")
+              lambda: int(peer.get_value("bag_recorder", "frames") or 0) > 1, "two notes")
     process.send_signal(number)
     assert process.wait(timeout=60) == 0
     with Bag(bag) as recorded:

@@ -11,8 +11,8 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from lidar_perception.nodes.graph import graph_of
-from lidar_perception.nodes.known import node_parameters
+from lidar_perception.nodes.graph import build_graph
+from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.nodes.param_files import read_sections
 from lidar_perception.types import InputError
 
@@ -89,8 +89,8 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
     detectors = FILES[name].split(",")
     config = str(ROOT / "config" / f"{'fused' if name == 'detectors' else name}.param.yaml")
     started = nodes(points="/cloud", use_sim_time="true", log_level="debug", reliability="reliable")
-    assert list(started) == list(graph_of(detectors))
-    assert list(nodes(single="true")) == list(graph_of(detectors, single=True))
+    assert list(started) == list(build_graph(detectors))
+    assert list(nodes(single="true")) == list(build_graph(detectors, single=True))
     assert ("~/input/points", "/cloud") in started["ground_segmentation"].remappings
     assert ("~/input/points", "ground_segmentation/output/points") in (
         started["clustering"].remappings)
@@ -115,7 +115,7 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
         assert node.parameters[1]["input.deskew"] == "odometry"
         assert ("~/input/odometry", "/odometry") in node.remappings
     assert all(n.parameters[1]["input.ahead"] == 180.0 for n in nodes(ahead="180").values())
-    with pytest.raises(InputError, match="ahead:=left is no number"):
+    with pytest.raises(InputError, match="ahead:=left is not a number"):
         nodes(ahead="left")
 
 
@@ -245,7 +245,7 @@ def test_tracking_in_one_process_is_a_parameter_of_the_detector(launched):
     _, nodes = launched("detectors")
     for name, node in nodes(tracking="true", single="true").items():
         assert node.executable != "tracker" and node.parameters[1]["tracking.enabled"] is True
-        assert "tracking.enabled" in node_parameters(name)
+        assert "tracking.enabled" in find_node_parameters(name)
         assert ("~/input/odometry", "odom") in node.remappings
 
 
@@ -294,7 +294,7 @@ def test_a_replay_plays_to_the_nodes_that_its_player_and_evaluator_know(descript
         perform_substitution=lambda s: arguments[s.args[0]],
         launch_configurations={**arguments, "namespace": "left", "detectors": "candidates"}))
     assert [a.msg for a in started if hasattr(a, "msg")] == [
-        "namespace:=left is no argument of replay.launch.py"]
+        "namespace:=left is not an argument of replay.launch.py"]
     player = next(n for n in started if getattr(n, "executable", "") == "bag_player")
     found = "candidate_refinement/output/detections"
     assert player.parameters[1]["follow"] == [found]
@@ -305,9 +305,9 @@ def test_a_replay_plays_to_the_nodes_that_its_player_and_evaluator_know(descript
     ({"detectors": "candidates,dream"}, "'dream' is none of candidates, pointpillars, pointnet"),
     ({"detectors": ""}, "detectors is empty"),
     ({"detectors": SEVERAL, "weights": "w.safetensors"}, "NAME=FILE"),
-    ({"detectors": SEVERAL, "weights": "v5=w"}, "'v5' is none of"),
-    ({"config": "all.yaml"}, "config: there is no parameter file all.yaml"),
-    ({"experts": "pointnets"}, "no parameter file pointnets, nor a detector"),
+    ({"detectors": SEVERAL, "weights": "v5=w"}, "'v5' is not one of"),
+    ({"config": "all.yaml"}, "config: no such parameter file: all.yaml"),
+    ({"experts": "pointnets"}, "pointnets is neither a parameter file nor a detector"),
 ])
 def test_what_cannot_be_started_is_refused_by_name(given, words, launched):
     with pytest.raises(InputError, match=words):

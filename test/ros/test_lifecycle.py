@@ -80,7 +80,7 @@ def change(peer, node, name):
 
 def drive(peer, node, *names):
     for name in names:
-        assert change(peer, node, name), (name, peer.message_of(node))
+        assert change(peer, node, name), (name, peer.get_message(node))
 
 
 @pytest.fixture
@@ -116,8 +116,8 @@ def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
     each time it is, on the newest cloud; a shutdown can be asked about afterwards."""
     node = f"ready/{NODE}"
     assert state(peer, node) == State.PRIMARY_STATE_UNCONFIGURED
-    peer.wait(lambda: peer.value_of(node, "lifecycle") == "unconfigured", "its diagnostics")
-    assert ord(peer.diagnostics[node].level) == 0 and peer.message_of(node) == "not configured"
+    peer.wait(lambda: peer.get_value(node, "lifecycle") == "unconfigured", "its diagnostics")
+    assert ord(peer.diagnostics[node].level) == 0 and peer.get_message(node) == "not configured"
     talker = peer.talker(f"/{node}/input/points", CLOUD)
     found = peer.listen(f"/{node}/output/detections", MARKERS)
     drive(peer, node, "configure")
@@ -130,31 +130,31 @@ def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
         assert_equal(received(found, round_ + 1), offline(weights, message(1)))
         drive(peer, node, "deactivate")
         peer.wait(lambda: not talker.get_subscription_count(), "the end of the subscription")
-        peer.wait(lambda: peer.value_of(node, "lifecycle") == "inactive"
-                  and peer.message_of(node) == "not active", "the state in the diagnostics")
+        peer.wait(lambda: peer.get_value(node, "lifecycle") == "inactive"
+                  and peer.get_message(node) == "not active", "the state in the diagnostics")
         assert received(found, round_) is None
     drive(peer, node, "cleanup", "configure", "activate")
     peer.send(talker, message(31), lambda: received(found, 31), "detections")
     assert not change(peer, node, "configure")  # rclpy would end the node
     drive(peer, node, "deactivate", "cleanup", "unconfigured_shutdown")
     process = f"ready.{NODE}"
-    assert not nodes.ended(process) and nodes.end(process) == 0
-    assert "asked for, but the node is active\n" in nodes.log(process)
+    assert not nodes.has_ended(process) and nodes.end(process) == 0
+    assert "is not possible: the node is active\n" in nodes.log(process)
     assert "Traceback" not in nodes.log(process)
 
 
 def test_a_node_that_nobody_asks_for_anything_says_so_while_there_is_input(here, peer, monkeypatch):
     """As one that was started again behind a manager's back; not one that was asked to rest."""
-    monkeypatch.setattr("lidar_perception.nodes.managed.UNASKED", 0.0)
+    monkeypatch.setattr("lidar_perception.nodes.managed.MANAGER_TIMEOUT_S", 0.0)
     for kind, topic, sent in ((GroundSegmentation, "points", CLOUD),
                               (TrackerNode, "detections", MARKERS)):
         node = here(kind, {"autostart": False}, {f"~/input/{topic}": f"/{topic}"})
         name = node.get_name()
-        peer.wait(lambda n=name: peer.message_of(n) == "not configured", "its diagnostics")
+        peer.wait(lambda n=name: peer.get_message(n) == "not configured", "its diagnostics")
         talker = peer.talker(f"/{topic}", sent)
         peer.wait_for_diagnostics(name, f"ros2 lifecycle set /{name} configure", level=1)
         peer.node.destroy_publisher(talker)
-        peer.wait(lambda n=name: peer.message_of(n) == "not configured", "the end of the input")
+        peer.wait(lambda n=name: peer.get_message(n) == "not configured", "the end of the input")
         drive(peer, name, "configure", "cleanup")
         peer.talker(f"/{topic}", sent)
         peer.wait(lambda n=node, t=topic: n.count_publishers(f"/{t}"), "the input again")
@@ -204,7 +204,7 @@ def test_a_node_without_its_network_waits_for_the_file_and_says_so(nodes, peer, 
         assert state(peer, driven) == State.PRIMARY_STATE_UNCONFIGURED
     for node in (driven, alone):
         peer.wait_for_diagnostics(node, reason, level=2)
-        peer.wait(lambda n=node: peer.value_of(n, "lifecycle") == "unconfigured", "the state")
+        peer.wait(lambda n=node: peer.get_value(n, "lifecycle") == "unconfigured", "the state")
         assert "ready" not in nodes.log(node.replace("/", "."))
     part = later.with_name("part")
     part.write_bytes(weights.read_bytes())
@@ -236,7 +236,7 @@ def test_an_activation_that_fails_is_said_and_tried_again(here, peer, monkeypatc
         node = here(GroundSegmentation, {}, {"~/input/points": "/in"})
         assert (node.state_label(), node.state[0]) == ("inactive", ERROR)
         assert "not active: RuntimeError: no such policy" in node.state[1]
-    monkeypatch.setattr("lidar_perception.nodes.managed.RETRY_PERIOD", 0.0)
+    monkeypatch.setattr("lidar_perception.nodes.managed.MIN_RETRY_PERIOD_S", 0.0)
     node._retry_at = 0.0
     peer.wait(lambda: node.active and node.state_label() == "active", "another attempt")
     assert node.state[1] == WAITING

@@ -19,8 +19,9 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
-from lidar_perception.nodes.inputs import Paired
+from lidar_perception.nodes.inputs import StampMatcher
 from lidar_perception.nodes.perception import Perception
+from lidar_perception.nodes.rclpy_compat import parameter_names
 from lidar_perception.nodes.runtime import ERROR, LATCHED, OK, WARN
 from lidar_perception.param_fields import collect_fields, flatten
 from lidar_perception.testing.clouds import cloud_message
@@ -41,7 +42,7 @@ def test_every_node_ends_with_code_0(processes, peer, tmp_path, drive_bag):
     for i, process in enumerate(processes.running.values()):
         process.send_signal(SIGNALS[i % 2])
     # Two seconds for each as a rule; where DDS hangs, stopping.py ends a node after 6.5.
-    peer.until(lambda: all(map(processes.ended, NODES)), 15.0)
+    peer.spin_until(lambda: all(map(processes.has_ended, NODES)), 15.0)
     assert {n: p.returncode for n, p in processes.running.items()} == dict.fromkeys(NODES, 0)
     logs = [*map(processes.log, NODES)]
     assert not any("Traceback" in log for log in logs)
@@ -89,7 +90,7 @@ def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
 def test_every_parameter_is_answered_and_a_list_may_be_empty_and_full(start, kind):
     """As ros2 param dump asks, and ros2 param set sets, where [] is a list of booleans."""
     node = start(kind)
-    declared = list(node._parameters)
+    declared = parameter_names(node)
     values = node.get_parameters(declared)
     assert not [p.name for p in values if p.value is None or p.type_ == Parameter.Type.NOT_SET]
     empty = [p for p in values if p.value == []]
@@ -130,7 +131,7 @@ from time import sleep
 from types import SimpleNamespace
 from lidar_perception.nodes import main, perception
 from lidar_perception.nodes.replay import bag_player
-stop = SimpleNamespace(closing=lambda: None, closed=lambda code: None)
+stop = SimpleNamespace(begin_closing=lambda: None, finish_closing=lambda code: None)
 for given in sys.argv[1:]:
     kind = bag_player.BagPlayer if "bag" in given else perception.Perception
     arguments = ["x", "--ros-args", "-r", "__node:=front", "-r", "__ns:=/left", *given.split()]
@@ -168,7 +169,7 @@ def test_a_template_that_is_not_there_is_found_out_with_the_first_cloud(percepti
     """A diagnostic, as the file may appear."""
     peer = shared_peer
     with peer.parameters("/perception", {"seed.file": "/nowhere.json"}):
-        peer.send(talker, good_cloud, lambda: "/nowhere.json" in peer.message_of("perception"),
+        peer.send(talker, good_cloud, lambda: "/nowhere.json" in peer.get_message("perception"),
                   "the diagnostic")
 
 
@@ -199,14 +200,14 @@ def test_markers_that_go_away_are_deleted_and_time_that_jumps_back_is_noticed(
     peer.send(talker, empty, lambda: len(from_marker_array(received[-1])) == 0, "no boxes")
     deleted = [m for r in received for m in r.markers if m.action == 2]
     assert {m.id for m in deleted} >= set(full.ids.tolist())
-    peer.wait(lambda: "time went back" in perception.log("perception"), "the log line")
+    peer.wait(lambda: "time jumped back" in perception.log("perception"), "the log line")
 
 
 def test_a_bag_that_starts_again_pairs_its_clouds_with_the_new_round():
     """Whichever comes first after the jump, nothing of the round before is given out."""
     for first in ("cloud", "partner"):
         delivered, dropped = [], []
-        paired = Paired(lambda c, p, d=delivered: d.append((c, p)), dropped=dropped.append)
+        paired = StampMatcher(lambda c, p, d=delivered: d.append((c, p)), on_drop=dropped.append)
         for round_ in range(3):
             for i in range(30):
                 stamp = i * 10**9
@@ -231,7 +232,7 @@ def test_clouds_wait_for_the_partner_with_their_stamp():
 
     for _ in range(50):
         delivered.clear()
-        paired = Paired(deliver, capacity=5)
+        paired = StampMatcher(deliver, capacity=5)
         arrivals = ([(i + rng.uniform(0, 2), "cloud", i) for i in range(20)]
                     + [(i + rng.uniform(0, 2), "partner", i) for i in range(20)])
         for _, kind, i in sorted(arrivals):

@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from lidar_perception.nodes.graph import chosen_clouds
+from lidar_perception.nodes.graph import choose_cloud_topic
 from lidar_perception.nodes.replay import pacing
 from lidar_perception.runs.threads import PASSIVE_WAITING
 from lidar_perception.types import InputError
@@ -38,14 +38,14 @@ def test_never_more_clouds_ahead_than_allowed_and_each_is_accounted_for():
             nonlocal answers
             number, topic = int(rng.integers(0, 40)), str(rng.choice(topics))
             before = len(pace.waiting)
-            pace.answered(stamp(number), topic)
+            pace.add_answer(stamp(number), topic)
             assert len(pace.waiting) <= before
             answers += 1
 
         for number in range(40):
-            pace.room(serve, lambda: False)
+            pace.wait_for_room(serve, lambda: False)
             assert len(pace.waiting) < ahead
-            pace.sent(b"\0" * 4 + stamp(number))
+            pace.add_cloud(b"\0" * 4 + stamp(number))
             assert list(pace.waiting)[-1] == stamp(number)
         assert answers and pace.unanswered <= 40 * len(topics)
 
@@ -53,10 +53,10 @@ def test_never_more_clouds_ahead_than_allowed_and_each_is_accounted_for():
 def test_an_answer_in_time_is_none_missed_and_a_later_one_says_that_none_will_come():
     pace = pace_of(["/a"], 2)
     for number in range(3):
-        pace.sent(b"\0" * 4 + stamp(number))
-    pace.answered(stamp(0), "/a")
+        pace.add_cloud(b"\0" * 4 + stamp(number))
+    pace.add_answer(stamp(0), "/a")
     assert pace.unanswered == 0 and list(pace.waiting) == [stamp(1), stamp(2)]
-    pace.answered(stamp(2), "/a")
+    pace.add_answer(stamp(2), "/a")
     assert pace.unanswered == 1 and not pace.waiting
 
 
@@ -70,20 +70,21 @@ def test_a_graph_that_never_answers_is_waited_for_once_and_then_briefly(monkeypa
 
     pace = pace_of(["/a"], 1, timeout=8.0)
     for number in range(5):
-        pace.room(serve, lambda: False)
-        pace.sent(b"\0" * 4 + stamp(number))
+        pace.wait_for_room(serve, lambda: False)
+        pace.add_cloud(b"\0" * 4 + stamp(number))
     assert pace.unanswered == 4 and 8 + 3 < pace.held <= 8 + 3 + 4 * 0.25
 
 
 def test_the_clouds_of_a_bag_are_found_or_those_it_has_are_named():
     cloud = "sensor_msgs/msg/PointCloud2"
-    assert chosen_clouds("bag", {"/velodyne": cloud, "/note": "std_msgs/msg/String"}) == "/velodyne"
+    types = {"/velodyne": cloud, "/note": "std_msgs/msg/String"}
+    assert choose_cloud_topic("bag", types) == "/velodyne"
     for types, wanted, words in [
             ({"/a": cloud, "/b": cloud}, "", "points:=TOPIC; it has /a, /b"),
             ({"/a": cloud}, "/points", "bag has no cloud on /points; it has /a"),
             ({"/note": "std_msgs/msg/String"}, "", "bag has no clouds")]:
         with pytest.raises(InputError, match=words):
-            chosen_clouds("bag", types, wanted)
+            choose_cloud_topic("bag", types, wanted)
 
 
 @pytest.mark.parametrize("own", [{}, {"OMP_WAIT_POLICY": "active"}], ids=["ours", "the user's"])

@@ -62,7 +62,7 @@ def test_bytes_arrive_as_they_are_in_the_bag(processes, peer, drive_bag, tmp_pat
                 TRUTH: peer.listen_raw(TRUTH, "visualization_msgs/msg/MarkerArray")}
     info = peer.listen(CAMERA_INFO, INFO, LATCHED)
     processes.start("bag_player", {}, {"bag": str(played), "wait_for": [POINTS, TRUTH]})
-    peer.wait(lambda: processes.ended("bag_player"), "the end of the bag")
+    peer.wait(lambda: processes.has_ended("bag_player"), "the end of the bag")
     peer.wait(lambda: all(len(received[t]) == len(expected[t]) for t in expected), "all messages")
     processes.check("bag_player")
     for topic, messages in expected.items():
@@ -76,7 +76,8 @@ def test_offset_duration_topics_and_remapping(processes, peer, text_bag):
     heard, note = peer.listen("/renamed", TEXT), peer.listen("/note", TEXT, LATCHED)
     start(processes, text_bag, start_offset=0.5, duration=1.0, remap=["/text:=renamed"],
           wait_for=["/renamed"], rate=10.0)
-    peer.wait(lambda: processes.ended("bag_player") and len(heard) >= 10 and note, "ten messages")
+    peer.wait(lambda: processes.has_ended("bag_player") and len(heard) >= 10 and note,
+              "ten messages")
     assert texts(heard) == [str(i) for i in range(5, 15)]
     assert texts(note) == ["latched"]  # although the offset skips it
     processes.check("bag_player")
@@ -85,7 +86,7 @@ def test_offset_duration_topics_and_remapping(processes, peer, text_bag):
 def test_a_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
     heard = peer.listen("/text", TEXT)
     start(processes, text_bag, start_paused=True)
-    peer.wait(lambda: "playing" in peer.message_of("bag_player"), "the start")
+    peer.wait(lambda: "playing" in peer.get_message("bag_player"), "the start")
     peer.call("/bag_player/resume", Trigger, Trigger.Request())
     peer.wait(lambda: heard, "a message")
     peer.call("/bag_player/pause", Trigger, Trigger.Request())
@@ -236,7 +237,7 @@ def test_looping_starts_again_and_the_clock_follows_the_bag(processes, peer, tex
 def test_it_waits_for_its_subscribers(processes, peer, text_bag):
     start(processes, text_bag, wait_for=["/text:=2"], rate=1.0)  # ten are kept for whom is late
     first = peer.listen("/text", TEXT)
-    peer.wait(lambda: peer.value_of("bag_player", "subscribers of /text") == "1", "one subscriber")
+    peer.wait(lambda: peer.get_value("bag_player", "subscribers of /text") == "1", "one subscriber")
     assert first == []
     second = peer.listen("/text", TEXT)
     peer.wait(lambda: len(first) == 20 and len(second) == 20, "all messages at both")
@@ -258,10 +259,10 @@ def test_it_waits_until_a_node_of_ours_has_met_who_listens_to_it(processes, peer
             KeyValue(key=f"subscribers of {between}", value=count)])]), until, what)
 
     start(processes, text_bag, wait_for=["/text", between], rate=1.0)
-    peer.wait(lambda: peer.value_of("bag_player", "subscribers of /text") == "1", "the player")
+    peer.wait(lambda: peer.get_value("bag_player", "subscribers of /text") == "1", "the player")
     peer.diagnostics.clear()
     tell("0", lambda: "bag_player" in peer.diagnostics, "the player's next diagnostic")
-    assert peer.message_of("bag_player") == WAITING and heard == []
+    assert peer.get_message("bag_player") == WAITING and heard == []
     tell("1", lambda: len(heard) == 20, "all messages")
 
 
@@ -270,8 +271,8 @@ BAD = {
     "nowhere": ({"bag": "/nowhere"}, "the bag /nowhere does not exist"),
     "topic": ({"topics": ["/other"]}, "no topic /other"),
     "remap": ({"remap": ["/text"]}, "OLD:=NEW"),
-    "bad_name": ({"remap": ["/text:=a b"]}, "'a b' is no name of a topic"),
-    "no_name": ({"remap": ["/text:="]}, "'' is no name of a topic"),
+    "bad_name": ({"remap": ["/text:=a b"]}, "'a b' is not a topic name"),
+    "no_name": ({"remap": ["/text:="]}, "'' is not a topic name"),
     "wait_for": ({"wait_for": ["/text:=x"]}, "must be TOPIC or TOPIC:=COUNT"),
     "offset": ({"start_offset": 60.0}, "start_offset 60 s is after the end"),
     "types": ({"remap": [f"{POINTS}:={TRUTH}"]}, "would have the types"),
@@ -305,8 +306,8 @@ def test_the_recorder_writes_what_the_player_plays(processes, peer, text_bag, tm
     processes.start("bag_recorder", {}, {"bag": str(tmp_path / "copy"),
                                          "topics": ["/text", "/note"]})
     start(processes, text_bag, rate=2.0)  # the player keeps ten for whom is late
-    peer.wait(lambda: processes.ended("bag_player")
-              and peer.value_of("bag_recorder", "frames") == "21", "21 recorded messages")
+    peer.wait(lambda: processes.has_ended("bag_player")
+              and peer.get_value("bag_recorder", "frames") == "21", "21 recorded messages")
     assert processes.stop()["bag_recorder"] == 0
     with Bag(tmp_path / "copy") as bag:
         assert [m.data for _, _, m in bag.messages({"/text"})] == [str(i) for i in range(20)]
@@ -318,7 +319,7 @@ def test_the_recorder_has_what_each_of_several_publishers_latched(processes, pee
     for i in range(6):  # as each node with a fixed sensor does on /tf_static
         peer.talker("/note", TEXT, LATCHED).publish(encode(bag_message(TEXT, data=str(i))))
     processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["/note"]})
-    peer.wait(lambda: peer.value_of("bag_recorder", "frames") == "6", "six messages")
+    peer.wait(lambda: peer.get_value("bag_recorder", "frames") == "6", "six messages")
     assert processes.stop()["bag_recorder"] == 0
     with Bag(tmp_path / "bag") as bag:
         assert sorted(m.data for _, _, m in bag.messages({"/note"})) == [*"012345"]
@@ -331,7 +332,7 @@ def test_a_publisher_that_comes_later_and_offers_less_is_recorded_too(processes,
                     namespace="robot")
 
     def frames():
-        return int(peer.value_of("robot/bag_recorder", "frames") or 0)
+        return int(peer.get_value("robot/bag_recorder", "frames") or 0)
     peer.send(first, bag_message(TEXT, data="first"), frames, "the first")
     before, later = frames(), peer.talker("/robot/text", TEXT, SENSOR_DATA)
     peer.send(later, bag_message(TEXT, data="later"), lambda: frames() > before, "the later one")
@@ -361,7 +362,7 @@ def test_a_type_that_is_not_installed_ends_no_recording(monkeypatch, peer, start
 def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tmp_path):
     """What waits has a bound, whatever comes; the clock of a simulation may stand."""
     from lidar_perception.nodes.replay import bag_recorder
-    monkeypatch.setattr(bag_recorder, "MAX_WAITING", 100)
+    monkeypatch.setattr(bag_recorder, "MAX_QUEUED", 100)
     held = threading.Event()
     monkeypatch.setattr(bag_recorder.BagWriter, "write", lambda *_: held.wait())
     kept = []
@@ -387,9 +388,9 @@ def test_a_bag_of_one_message_in_a_loop_floods_nobody_and_hears_its_services(
     from lidar_perception.nodes.replay import bag_player
     from lidar_perception.params import PlayerParams
     player, now, sent, served = bag_player.BagPlayer.__new__(bag_player.BagPlayer), [50.0], [], []
-    player.params, player.wanted, player.clock = PlayerParams(loop=True), {}, None
+    player.params, player.awaited, player.clock = PlayerParams(loop=True), {}, None
     player.paused, player.steps, player.stop = False, 0, Future()
-    player.served, player.report, player._count_pace = 0.0, lambda *_: None, lambda: None
+    player.served_at, player.report, player._count_pace = 0.0, lambda *_: None, lambda: None
     player._wait_until_delivered = lambda: None
     monkeypatch.setattr(bag_player, "monotonic", lambda: now[0])
 

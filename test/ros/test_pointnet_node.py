@@ -82,8 +82,8 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
 
     peer.wait(lambda: all(times.values()), "the times of the steps")
     assert times["network"][-1].data > 0
-    peer.wait(lambda: peer.value_of(NODE, "detections"), "counts")
-    assert peer.value_of(NODE, "network").startswith("improved, Car")
+    peer.wait(lambda: peer.get_value(NODE, "detections"), "counts")
+    assert peer.get_value(NODE, "network").startswith("improved, Car")
 
 
 def test_no_cloud_ends_the_detector_and_each_has_its_reason(talker, found, shared_processes, peer,
@@ -107,7 +107,7 @@ def test_no_cloud_ends_the_detector_and_each_has_its_reason(talker, found, share
     }
     for name, (msg, words) in strange.items():
         peer.diagnostics.clear()
-        peer.send(talker, msg, lambda w=words: w in peer.message_of(NODE), f"'{words}': {name}")
+        peer.send(talker, msg, lambda w=words: w in peer.get_message(NODE), f"'{words}': {name}")
     peer.send(talker, message(7), lambda: received(found, 7), "detections of a good cloud")
     assert_equal(received(found, 7), offline(weights, message(7)))
 
@@ -116,7 +116,7 @@ def test_no_cloud_ends_the_detector_and_each_has_its_reason(talker, found, share
         peer.send(talker, message(8), lambda: received(found, 8) is not None, "no detections")
         assert len(received(found, 8)) == 0
         peer.wait_for_diagnostics(NODE, "threshold in pointnet.scores")
-        peer.wait(lambda: "Car 0." in (peer.value_of(NODE, "best scores") or ""), "the scores")
+        peer.wait(lambda: "Car 0." in (peer.get_value(NODE, "best scores") or ""), "the scores")
     log = shared_processes.log(NODE)
     assert "Traceback" not in log and "Warning" not in log
 
@@ -145,14 +145,15 @@ def test_weights_that_cannot_be_used_are_a_diagnostic(shared_processes, peer, tm
         shared_processes.start(NODE, REMAP, {"pointnet.weights": str(make(tmp_path))}, f"bad{i}")
     talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
     for i, (make, words) in enumerate(UNUSABLE.values()):
-        peer.send(talker, message(1), lambda n=f"bad{i}/{NODE}", w=words: w in peer.message_of(n),
+        peer.send(talker, message(1), lambda n=f"bad{i}/{NODE}", w=words: w in peer.get_message(n),
                   words)
         assert ord(peer.diagnostics[f"bad{i}/{NODE}"].level) == 2 and not found
         node = f"bad{i}.{NODE}"
         maps = Path(f"/proc/{shared_processes.running[node].pid}/maps")
         if make is missing_weights and maps.is_file():
             assert "libtorch" not in maps.read_text()  # which takes seconds and 200 MB
-        assert not shared_processes.ended(node) and "Traceback" not in shared_processes.log(node)
+        assert not shared_processes.has_ended(node)
+        assert "Traceback" not in shared_processes.log(node)
 
 
 def test_help_knows_the_node(capsys):

@@ -79,8 +79,8 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
 
     peer.wait(lambda: all(times.values()), "the times of the steps")
     assert times["network"][-1].data > 0
-    peer.wait(lambda: peer.value_of(NODE, "detections"), "counts")
-    assert peer.value_of(NODE, "network").startswith("v4 compact")
+    peer.wait(lambda: peer.get_value(NODE, "detections"), "counts")
+    assert peer.get_value(NODE, "network").startswith("v4 compact")
 
 
 def test_no_cloud_ends_the_detector_and_each_has_its_reason(talker, found, shared_processes, peer,
@@ -109,7 +109,7 @@ def test_no_cloud_ends_the_detector_and_each_has_its_reason(talker, found, share
     }
     for name, (msg, words) in strange.items():
         peer.diagnostics.clear()
-        peer.send(talker, msg, lambda w=words: w in peer.message_of(NODE), f"'{words}': {name}")
+        peer.send(talker, msg, lambda w=words: w in peer.get_message(NODE), f"'{words}': {name}")
     peer.send(talker, message(7), lambda: received(found, 7), "detections of a good cloud")
     assert_equal(received(found, 7), offline(weights, message(7)))
     log = shared_processes.log(NODE)
@@ -132,11 +132,11 @@ def test_thresholds_change_at_run_time_and_what_cannot_is_refused(talker, found,
                                       for name in ("car", "pedestrian", "cyclist")}):
         peer.send(talker, message(12), lambda: received(found, 12) is not None, "no detections")
         assert len(received(found, 12)) == 0
-        peer.wait(lambda: "below its threshold" in peer.message_of(NODE), "the reason")
-        peer.wait(lambda: "Car 0." in (peer.value_of(NODE, "best scores") or ""), "the scores")
+        peer.wait(lambda: "below its threshold" in peer.get_message(NODE), "the reason")
+        peer.wait(lambda: "Car 0." in (peer.get_value(NODE, "best scores") or ""), "the scores")
     with peer.parameters(f"/{NODE}", {"ground.sensor_pose.height": 1.2}):
         peer.send(talker, message(13), lambda: "ground.sensor_pose.height is 1.2"
-                  in peer.message_of(NODE), "the wrong height")
+                  in peer.get_message(NODE), "the wrong height")
 
 
 def checkpoint_of_another_size(folder):
@@ -183,12 +183,12 @@ def to_unusable(peer):
 def test_weights_that_cannot_be_used_are_a_diagnostic(case, unusable, to_unusable,
                                                       shared_processes, peer):
     (_, level, words), node = UNUSABLE[case], unusable[case]
-    peer.send(to_unusable, message(1), lambda: words in peer.message_of(node), words)
+    peer.send(to_unusable, message(1), lambda: words in peer.get_message(node), words)
     assert ord(peer.diagnostics[node].level) == level
     peer.diagnostics.clear()
-    peer.wait(lambda: words in peer.message_of(node), "the diagnostic again")
+    peer.wait(lambda: words in peer.get_message(node), "the diagnostic again")
     log = node.replace("/", ".")
-    assert not shared_processes.ended(log) and "Traceback" not in shared_processes.log(log)
+    assert not shared_processes.has_ended(log) and "Traceback" not in shared_processes.log(log)
 
 
 def test_without_weights_the_node_lives_says_so_and_finds_nothing(processes, shared_peer,
@@ -205,10 +205,10 @@ def test_without_weights_the_node_lives_says_so_and_finds_nothing(processes, sha
     peer, node = shared_peer, f"none/{NODE}"
     found = peer.listen(f"/{node}/output/detections", MARKERS)
     peer.send(to_unusable, message(1), lambda: f"no weights for {missing}" in
-              peer.message_of(node), "the diagnostic")
+              peer.get_message(node), "the diagnostic")
     peer.diagnostics.clear()
-    peer.wait(lambda: f"no weights for {missing}" in peer.message_of(node), "it again")
-    assert not found and not processes.ended(f"none.{NODE}")
+    peer.wait(lambda: f"no weights for {missing}" in peer.get_message(node), "it again")
+    assert not found and not processes.has_ended(f"none.{NODE}")
     maps = Path(f"/proc/{processes.running[f'none.{NODE}'].pid}/maps")
     if maps.is_file():
         assert "libtorch" not in maps.read_text()  # which takes seconds and 200 MB

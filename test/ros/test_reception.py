@@ -23,16 +23,20 @@ from lidar_perception.nodes.graph import STAGES
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.reception import (
     BEST_EFFORT,
-    RATE_OF,
+    RATE_INTERVALS,
     RELIABLE,
-    SHARE_OF,
+    WINDOW,
     Arrivals,
     Reception,
 )
 from lidar_perception.nodes.runtime import LATCHED
 from lidar_perception.nodes.runtime import RELIABLE as RELIABLE_QOS
-from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES, SOCKET_BUFFER, socket_buffer
-from lidar_perception.nodes.track_outputs import lifetime_ns
+from lidar_perception.nodes.shared_memory import (
+    PROFILE_VARIABLES,
+    SOCKET_BUFFER,
+    read_socket_buffer_size,
+)
+from lidar_perception.nodes.track_outputs import find_marker_lifetime_ns
 from lidar_perception.params import MarkerParams, ReceptionParams
 from lidar_perception.wire.codec import encode
 from msg_utils.stamps import to_ns
@@ -64,7 +68,7 @@ def test_an_ordinary_driver(processes, peer):
     hold a cloud, and what is lost is counted and said with a remedy; the end of it is an ERROR,
     then STALE, then forgotten."""
     def value(key):
-        return int(peer.value_of(NODE, key) or 0)
+        return int(peer.get_value(NODE, key) or 0)
 
     def level():
         return ord(peer.diagnostics[NODE].level)
@@ -78,30 +82,30 @@ def test_an_ordinary_driver(processes, peer):
                                                       3, "input.max_lost": 0})
     with driver(peer, "reliable", 30):
         peer.wait(lambda: done() == 30, "all clouds of a reliable driver")
-    assert value("lost") == 0 and peer.value_of(NODE, "reliability") == "reliable"
+    assert value("lost") == 0 and peer.get_value(NODE, "reliability") == "reliable"
     assert peer.diagnostics[NODE].hardware_id == "driver_lidar"
     peer.wait(lambda: level() == ERROR and "no cloud on /in for more than 1 s"
-              in peer.message_of(NODE), "the silence")
-    peer.wait(lambda: level() == STALE and "more than 3 s" in peer.message_of(NODE), "it is stale")
+              in peer.get_message(NODE), "the silence")
+    peer.wait(lambda: level() == STALE and "more than 3 s" in peer.get_message(NODE), "it is stale")
 
     before = value("frames")
     with driver(peer, "best_effort", 30, first=100):
         peer.wait(lambda: value("last_stamp_ns") >= 120 * 10**9 or value("lost"), "clouds")
-        assert peer.value_of(NODE, "reliability") == "best effort"
-    peer.wait(lambda: "no cloud" in peer.message_of(NODE), "the end")
+        assert peer.get_value(NODE, "reliability") == "best effort"
+    peer.wait(lambda: "no cloud" in peer.get_message(NODE), "the end")
     assert value("frames") > before and done() + value("lost") <= 60
-    if socket_buffer() >= SOCKET_BUFFER:
+    if read_socket_buffer_size() >= SOCKET_BUFFER:
         assert done() - 30 > 15  # a plain rclpy subscriber gets a third of them
     if value("lost"):
         log = (processes.logs / f"{NODE}.log").read_text()
         assert log.count("were lost on the way; let /driver publish reliable") == 1
     peer.set_parameter(f"/{NODE}", "input.error_after", 1000)
     peer.set_parameter(f"/{NODE}", "input.stale_after", 1000)
-    peer.wait(lambda: "no cloud" not in peer.message_of(NODE), "no limit")
+    peer.wait(lambda: "no cloud" not in peer.get_message(NODE), "no limit")
 
     with driver(peer, "reliable", 30, points=2000, first=200):  # some pass while the node changes
         peer.wait(lambda: value("last_stamp_ns") == 229 * 10**9, "a reliable one again")
-        assert peer.value_of(NODE, "reliability") == "reliable"
+        assert peer.get_value(NODE, "reliability") == "reliable"
     processes.check()
 
 
@@ -113,20 +117,20 @@ def test_the_newest_cloud_wins_and_the_others_are_counted(processes, peer):
                      for stamp, n in enumerate([1_000_000, *[2000] * 40], start=2))
     peer.wait(talker.get_subscription_count, "the node")
     talker.publish(encode(cloud(np.ones((9, 3)), 1)))
-    peer.wait(lambda: peer.value_of(NODE, "frames") == "1", "the first cloud")
+    peer.wait(lambda: peer.get_value(NODE, "frames") == "1", "the first cloud")
     for data in (large, *small):
         talker.publish(data)
-    peer.wait(lambda: peer.value_of(NODE, "last_stamp_ns") == "42", "the newest")
+    peer.wait(lambda: peer.get_value(NODE, "last_stamp_ns") == "42", "the newest")
 
     def accounted():
-        return [int(peer.value_of(NODE, key)) for key in ("frames", "dropped", "lost")]
+        return [int(peer.get_value(NODE, key)) for key in ("frames", "dropped", "lost")]
 
     peer.wait(lambda: sum(accounted()) == 42, "an account of every cloud")
     assert accounted()[0] < 30
     other = peer.talker("/in", CLOUD)
-    peer.wait(lambda: "2 publishers on /in (/peer, /peer)" in peer.message_of(NODE), "a warning")
+    peer.wait(lambda: "2 publishers on /in (/peer, /peer)" in peer.get_message(NODE), "a warning")
     peer.node.destroy_publisher(other)
-    peer.wait(lambda: "publishers" not in peer.message_of(NODE), "no warning")
+    peer.wait(lambda: "publishers" not in peer.get_message(NODE), "no warning")
 
 
 SIDES = "left", "right"
@@ -188,9 +192,9 @@ def test_every_cloud_is_accounted_for():
             sizes.append(steps[0] - 1)
         first = sizes[0]  # nobody knows how many came before the first
         assert arrivals.sent == number - first == taken + arrivals.dropped + arrivals.lost
-        sent, lost, dropped = arrivals.recent()
-        assert 0 <= lost + dropped < sent and sent >= SHARE_OF
-        assert arrivals.learned == pytest.approx(10) and arrivals.rate() == pytest.approx(10)
+        sent, lost, dropped = arrivals.count_recent()
+        assert 0 <= lost + dropped < sent and sent >= WINDOW
+        assert arrivals.learned == arrivals.measure_rate() == pytest.approx(10)
 
 
 def test_what_a_full_queue_has_pushed_out_was_not_lost_on_the_way():
@@ -216,10 +220,10 @@ def test_a_sensor_that_slows_down_is_seen_by_its_own_clock():
     arrivals = Arrivals(5)
     for number in range(1, 30):
         arrivals.add(infos([number]), 0)
-    for info in infos(range(30, 30 + RATE_OF)):
+    for info in infos(range(30, 30 + RATE_INTERVALS)):
         info["source_timestamp"] = 29 * 10**8 + (info["publication_sequence_number"] - 29) * 10**9
         arrivals.add([info], 0)
-    assert arrivals.learned == pytest.approx(10) and arrivals.rate() == pytest.approx(1)
+    assert arrivals.learned == pytest.approx(10) and arrivals.measure_rate() == pytest.approx(1)
 
 
 OVERRIDE = f"qos_overrides./{NODE}/input/points.subscription.reliability"
@@ -283,13 +287,13 @@ def test_who_has_lost_clouds_is_named_when_it_is_gone_as_before(start, monkeypat
 def test_problem_names_the_kind_of_publisher(monkeypatch, topic, what, publisher, silent, slow):
     late = Late(monkeypatch, lambda stamp: 0.0, rate=10.0)
     late.reception.topic, late.reception.what = topic, what
-    late.reception.met = [SimpleNamespace(node_namespace="/", node_name=publisher)
+    late.reception.last_publishers = [SimpleNamespace(node_namespace="/", node_name=publisher)
                           ] * bool(publisher)
     late.reception.last_time, late.now = 1.0, 4.0
     said, = (text for _, _, text in late.reception.problems())
     assert said.startswith(f"no {what} on {topic} for more than 2 s: ") and silent in said
     late.now = 1.0
-    monkeypatch.setattr(late.reception.arrivals, "rate", lambda: 3.0)
+    monkeypatch.setattr(late.reception.arrivals, "measure_rate", lambda: 3.0)
     said, = (text for _, _, text in late.reception.problems())
     assert slow in said and ("sensor" in said) == (topic == "/velodyne_points")
 
@@ -322,9 +326,9 @@ class Late:
         for tick in range(1, round(seconds * 100)):
             self.now = tick / 100
             if tick % 10 == 0:
-                self.reception._received(self.now, {"publication_sequence_number": tick // 10,
+                self.reception._on_message(self.now, {"publication_sequence_number": tick // 10,
                                                     "source_timestamp": tick * 10**7})
-            self.reception.try_again()
+            self.reception.retry()
             while self.todo:
                 self.todo.pop(0)()
 
@@ -340,9 +344,9 @@ def test_a_slow_sensor_is_not_silent_between_two_clouds_and_its_boxes_stay(
                             (1.1 + stale, ["stale"])):
         assert [kind for kind, _, _ in late.reception.problems()] == kinds
     for wanted, stay in ((0, 0), (2, lifetime), (9, 9)):
-        node = SimpleNamespace(_receptions=lambda: [late.reception], robot=SimpleNamespace(
+        node = SimpleNamespace(_receptions=lambda: [late.reception], node_params=SimpleNamespace(
             output=MarkerParams(marker_lifetime=wanted)))
-        assert lifetime_ns(node) == stay * 10**9
+        assert find_marker_lifetime_ns(node) == stay * 10**9
 
 
 @pytest.mark.parametrize("lag, rate", [(0.0, 10), (0.05, 10), (0.13, 10), (0.25, 4), (0.6, 1.6)])

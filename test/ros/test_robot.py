@@ -55,12 +55,12 @@ def test_a_cropped_cloud_over_dds_is_the_cropped_frame_offline(processes, peer, 
     np.testing.assert_array_equal(in_view, usable.take(segmented.indices))
     np.testing.assert_array_equal(read_column(clouds[-1], "ground", in_view) > 0, segmented.ground)
     cropped = str(len(frame) - len(segmented.indices))
-    peer.wait(lambda: peer.value_of("perception", "cropped") == cropped, "the count")
+    peer.wait(lambda: peer.get_value("perception", "cropped") == cropped, "the count")
 
     peer.set_parameter("/ground_segmentation", "crop.sectors", [0, 360])
     peer.send(talker, cloud, lambda: not read_column(clouds[-1], "in_view", everything).any(),
               "a cloud of which nothing is left")
-    peer.wait(lambda: "crop.* leaves none" in peer.message_of("ground_segmentation"), "the reason")
+    peer.wait(lambda: "crop.* leaves none" in peer.get_message("ground_segmentation"), "the reason")
 
 
 def test_a_tilted_sensor_gets_its_mounting_from_tf(processes, peer):
@@ -85,7 +85,7 @@ def test_a_tilted_sensor_gets_its_mounting_from_tf(processes, peer):
     early, late = (transforms(("odom", "base", moved, START + i * PERIOD)) for i in (-1, 1))
     peer.send(moving, early, moving.get_subscription_count, "a subscriber of /tf")
     peer.send(talker, message(xyz), lambda: "waits for the newest transform of 'odom' -> 'base'"
-              in peer.message_of("perception"), "a cloud, once /tf_static is there, to wait")
+              in peer.get_message("perception"), "a cloud, once /tf_static is there, to wait")
     peer.send(moving, late, lambda: found and from_marker_array(found[-1]).frame_id == "odom",
               "the person, in a cloud that has waited")
     objects = from_marker_array(found[-1])

@@ -218,7 +218,7 @@ def test_without_the_frames_the_parameters_stand_and_the_names_are_said(start):
         give(node, message(xyz))
     assert asks.sent["detections"] == plain.sent["detections"]
     said = problems(asks)
-    for words in ("base_frame 'base_footprint'", "'lidar' is not in TF", "sensor_pose stands",
+    for words in ("base_frame 'base_footprint'", "'lidar' is not in TF", "sensor_pose is used",
                   "target_frame 'odom'", "results are in 'lidar'"):
         assert words in said
     assert "frame" not in problems(plain)
@@ -226,7 +226,7 @@ def test_without_the_frames_the_parameters_stand_and_the_names_are_said(start):
         ("odom", "base_footprint", np.eye(4), START),
         ("base_footprint", "lidar", mounted(0, 0, -1.0, 0, 0, 0), START)), static=True)
     give(asks, message(xyz, START + 1))
-    assert "-1.00 m above 'base_footprint', which is to be on the ground" in problems(asks)
+    assert "-1.00 m above 'base_footprint', which must be on the ground" in problems(asks)
     assert "odom" not in problems(asks)
 
 
@@ -239,7 +239,7 @@ def test_the_body_is_cropped_only_where_the_frame_that_it_is_given_in_is_known(s
     seen = transform_points(np.vstack([floor, [[0.3, 0.0, 0.8]], [[0.9, 0.0, 0.8]]]),
                             invert_pose(sensor))
     give(node, message(seen))
-    assert not node.counts["cropped"] and "crop.body is not left out" in problems(node)
+    assert not node.counts["cropped"] and "crop.body is not cropped" in problems(node)
     node.transforms.on_tf(transforms(("base", "lidar", sensor, START)), static=True)
     give(node, message(seen, START + 1))
     assert node.counts["cropped"] == 1 and "crop.body" not in problems(node)
@@ -255,9 +255,9 @@ def test_where_tf_does_not_connect_the_odometry_what_moves_is_listened_to(start)
     node = start(GroundSegmentation, **{"input.deskew": "odometry"})
     for stamp in (START, START + PERIOD):
         node.transforms.on_odometry(odometry(np.eye(4), stamp, "base"))
-    assert not node.transforms._listening
+    assert not node.transforms._has_tf_subscription
     give(node, message(np.ones((50, 3)), t=np.arange(50, dtype="<u4") * 10**6))
-    assert node.transforms._listening and "'lidar' is not in TF" in problems(node)
+    assert node.transforms._has_tf_subscription and "'lidar' is not in TF" in problems(node)
 
 
 def test_a_template_that_cannot_be_read_costs_the_candidates_alone(start):
@@ -272,9 +272,9 @@ def test_a_cloud_waits_for_a_transform_that_is_late_or_that_never_came(start):
     xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     node = start(Perception, target_frame="odom")
     deliver, msg = node._receptions()[0].deliver, encode(message(xyz))
-    node.transforms.lacking["TF"] = NO_TF
+    node.transforms.problem_by_source["TF"] = NO_TF
     assert deliver(msg, True) is None and boxes_of(node)[1] == "lidar"
-    del node.transforms.lacking["TF"]
+    del node.transforms.problem_by_source["TF"]
     assert "'odom'" in deliver(msg, True) and len(node.sent["detections"]) == 1
     node.transforms.on_tf(transforms(("odom", "lidar", np.eye(4), START - PERIOD)), static=False)
     assert "0.100 s older than needed" in deliver(msg, True)

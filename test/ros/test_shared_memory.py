@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from lidar_perception.nodes import shared_memory
-from lidar_perception.nodes.graph import private_domain
+from lidar_perception.nodes.graph import reserve_domain
 from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES
 
 
@@ -26,12 +26,12 @@ from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES
     ("~/input/points:=clustering/output/points", 8 << 20, "fastdds.xml")])
 def test_clouds_of_a_driver_come_by_udp_where_a_socket_holds_one(remap, buffer, profile,
                                                                  monkeypatch):
-    monkeypatch.setattr(shared_memory, "socket_buffer", lambda: buffer)
+    monkeypatch.setattr(shared_memory, "read_socket_buffer_size", lambda: buffer)
     monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=1 << 20, f_frsize=4096))
     for name in PROFILE_VARIABLES:
         monkeypatch.setenv(name, "")
     arguments = ["pointpillars_detector", "--ros-args", "-r", remap]
-    shared_memory.use_large_shared_memory(shared_memory.fed_by_a_driver(arguments))
+    shared_memory.use_large_shared_memory(shared_memory.is_fed_by_driver(arguments))
     assert {Path(os.environ[name]).name for name in PROFILE_VARIABLES} == {profile}
     assert Path(os.environ[PROFILE_VARIABLES[0]]).is_file()
     shared_memory.use_large_shared_memory(True)  # what is set stays
@@ -58,7 +58,7 @@ def short():
     while True:
         process = subprocess.Popen(
             [sys.executable, "-c", code], text=True, stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE, env={**os.environ, "ROS_DOMAIN_ID": str(private_domain())})
+            stdout=subprocess.PIPE, env={**os.environ, "ROS_DOMAIN_ID": str(reserve_domain())})
         process.stdout.readline()
         if alone(process):
             return process

@@ -21,8 +21,8 @@ from lidar_perception.ground.obstacles import find_obstacles
 from lidar_perception.ground.params import ObstacleParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.nodes import load_node_class
-from lidar_perception.nodes.graph import BEHIND, SINGLE, graph_of
-from lidar_perception.nodes.watch import leave, new_context
+from lidar_perception.nodes.external_node import create_context, shut_down_context
+from lidar_perception.nodes.graph import DETECTOR_NODES, SINGLE, build_graph
 from lidar_perception.wire.messages import to_frame
 from lidar_perception.wire.topics import POINTS
 from msg_utils.point_cloud2 import to_array
@@ -54,10 +54,10 @@ RVIZ = {"rviz_default_plugins/PointCloud2": CLOUD, "rviz_default_plugins/MarkerA
 def graph(domain):
     """topic -> type, and topic -> QoS of the publishers, of all nodes with the names that launch
     files give their topics, what they listen to included."""
-    context = new_context(domain)
+    context = create_context(domain)
     nodes, types, offered = [], {}, {}
-    for name, remap in {**graph_of([*BEHIND]), **SINGLE,
-                        **graph_of(["candidates"], tracking=True)}.items():
+    for name, remap in {**build_graph([*DETECTOR_NODES]), **SINGLE,
+                        **build_graph(["candidates"], tracking=True)}.items():
         rules = [word for rule in remap.items() for word in ("-r", ":=".join(rule))]
         node = load_node_class(name)(context=context, cli_args=["--ros-args", *rules])
         node.start()  # managed nodes have their topics then
@@ -68,7 +68,7 @@ def graph(domain):
             types[topic] = kinds[0]
             offered[topic] = node.get_publishers_info_by_topic(topic)[0].qos_profile
     yield types, offered
-    leave(context, *nodes)
+    shut_down_context(context, *nodes)
 
 
 def rviz_manager():

@@ -15,16 +15,16 @@ signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
 from lidar_perception.nodes.stopping import Stop
 import threading
 stop, awake = Stop(STOP_SIGNALS), threading.Event()
-stop.react = awake.set
+stop.on_signal = awake.set
 hang = lambda: ctypes.PyDLL(None).sleep(60)  # a call that keeps the interpreter's lock
 print("ready", flush=True)
 {rest}
 """
 WORK_HANGS = "hang()"
-TEARDOWN_HANGS = "awake.wait(); stop.closing(); stop.closed(3); hang()"
-WRITES_LONG = ("from time import sleep\nawake.wait(); stop.closing(); sleep(7)\n"
-               "print('written', flush=True); stop.closed(0)")
-ENDS_BY_ITSELF = "stop.closing(); stop.closed(2); hang()"
+TEARDOWN_HANGS = "awake.wait(); stop.begin_closing(); stop.finish_closing(3); hang()"
+WRITES_LONG = ("from time import sleep\nawake.wait(); stop.begin_closing(); sleep(7)\n"
+               "print('written', flush=True); stop.finish_closing(0)")
+ENDS_BY_ITSELF = "stop.begin_closing(); stop.finish_closing(2); hang()"
 REFUSED = """
 from lidar_perception.nodes.main import _spin
 from lidar_perception.types import InputError
@@ -86,17 +86,17 @@ class Changing:
 
 
 @pytest.mark.parametrize("looks", [3, 10**9])
-def test_a_node_in_this_process_leaves_when_no_other_does_or_after_a_while(looks, monkeypatch):
-    """Else Fast DDS may wait for ever."""
+def test_context_shuts_down_once_the_graph_has_settled(looks, monkeypatch):
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
-    from lidar_perception.nodes import watch
+    from lidar_perception.nodes import external_node
+    from lidar_perception.nodes.external_node import MAX_SETTLE_S, SETTLE_S, shut_down_context
     clock, ended = [0.0], []
-    monkeypatch.setattr(watch, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(watch, "sleep", lambda s: clock.__setitem__(0, clock[0] + s))
+    monkeypatch.setattr(external_node, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(external_node, "sleep", lambda s: clock.__setitem__(0, clock[0] + s))
     context, node = SimpleNamespace(try_shutdown=lambda: ended.append(clock[0])), Changing(looks)
-    watch.leave(context, node)
+    shut_down_context(context, node)
     if looks == 3:
-        assert node.destroyed < 0 and watch.STILL < ended[0] < 2 * watch.STILL
+        assert node.destroyed < 0 and SETTLE_S < ended[0] < 2 * SETTLE_S
     else:
-        assert watch.STILL_AT_LAST <= ended[0] < watch.STILL_AT_LAST + watch.STILL
+        assert MAX_SETTLE_S <= ended[0] < MAX_SETTLE_S + SETTLE_S
     assert node.destroyed is not None

@@ -13,7 +13,7 @@ from tracking_samples import CAR, CYCLIST, START, TENTH, car, cars, crowd, perso
 
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.data.bag import Bag
-from lidar_perception.nodes.graph import ODOMETRY_IN, graph_of
+from lidar_perception.nodes.graph import ODOMETRY_INPUT, build_graph
 from lidar_perception.nodes.tracker import TrackerNode
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.scoring.tracking.pairs import tracked_labels
@@ -76,7 +76,7 @@ def looped(domain, drive_bag, tmp_path_factory):
     """What the graph says while a drive is played three times: the messages of each topic, those
     of the same stamp in the order in which they came."""
     params = with_values(BEST, {"seed.source": "automatic"})
-    graph = graph_of(["candidates"], single=True, tracking=True)
+    graph = build_graph(["candidates"], single=True, tracking=True)
     outputs = {"found": "/perception/output/detections", "behind": "/tracker/output/tracks",
                "inside": "/perception/output/tracks"}
     with Bag(drive_bag) as bag:
@@ -87,10 +87,10 @@ def looped(domain, drive_bag, tmp_path_factory):
         for node, remap in graph.items():
             extra = ({**flatten(params), "tracking.enabled": True, "input.queue": 2}
                      if node == "perception" else {})
-            processes.start(node, {**remap, **ODOMETRY_IN}, {**extra, "ego.max_wait": 60.0})
+            processes.start(node, {**remap, **ODOMETRY_INPUT}, {**extra, "ego.max_wait": 60.0})
         listeners = {"found": 2, "behind": 1, "inside": 1}  # as each node itself sees them
         peer.wait(lambda: all(
-            int(peer.value_of(topic.split("/")[1], f"subscribers of {topic}") or 0)
+            int(peer.get_value(topic.split("/")[1], f"subscribers of {topic}") or 0)
             >= listeners[name] for name, topic in outputs.items()), "the nodes to be connected")
         processes.start("bag_player", {}, {
             "bag": str(drive_bag), "loop": True,
@@ -101,7 +101,7 @@ def looped(domain, drive_bag, tmp_path_factory):
         peer.wait(lambda: min(map(len, heard.values())) > 2.5 * clouds, "the drive, three times",
                   300.0)
         processes.check()
-        diagnostics = {key: peer.value_of(NODE, key) for key in ("alive", "born", "ended")}
+        diagnostics = {key: peer.get_value(NODE, key) for key in ("alive", "born", "ended")}
     return clouds, heard, diagnostics
 
 
@@ -156,14 +156,14 @@ def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes,
     processes.start(NODE, REMAP, {})
     talker, tracks = peer.talker("/found", MARKERS), peer.listen("/tracks", MARKERS)
     moving, now = peer.talker("/moved", ODOMETRY_TYPE), START
-    peer.wait(lambda: peer.message_of(NODE) and talker.get_subscription_count()
+    peer.wait(lambda: peer.get_message(NODE) and talker.get_subscription_count()
               and moving.get_subscription_count(), "the tracker")
 
     def send(message, words="tracking", answered=True):
         """Publish once; wait for the tracks, if there are to be any, and for the reason."""
         shown = len(tracks)
         talker.publish(encode(message))
-        peer.wait(lambda: words in peer.message_of(NODE) and len(tracks) >= shown + answered,
+        peer.wait(lambda: words in peer.get_message(NODE) and len(tracks) >= shown + answered,
                   f"'{words}'")
         return tracks[-1]
 
@@ -178,7 +178,7 @@ def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes,
             stamp = now + (i + 1) * TENTH
             message = make_odometry(at, header(stamp, "odom"), child, bag_message)
             moving.publish(encode(message))
-        peer.send(moving, message, lambda: peer.value_of(NODE, "last_pose_ns") == str(stamp),
+        peer.send(moving, message, lambda: peer.get_value(NODE, "last_pose_ns") == str(stamp),
                   "the poses")
 
     found = cars(car(10))

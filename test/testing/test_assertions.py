@@ -10,7 +10,7 @@ from samples import each_make, header, scene, walker_truth
 
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
-from lidar_perception.nodes.graph import private_domain
+from lidar_perception.nodes.graph import reserve_domain
 from lidar_perception.testing.bags import recording
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.testing.detections import assert_detections, objects_of
@@ -147,4 +147,4 @@ def test_without_launch_it_says_what_is_missing(monkeypatch):
 
 
 def test_a_private_domain_stays_private_while_nothing_runs_there():
-    assert len({private_domain() for _ in range(5)}) == 5
+    assert len({reserve_domain() for _ in range(5)}) == 5

@@ -1,4 +1,4 @@
-"""Records topics to an MCAP bag, where ros2 bag is not installed."""
+"""Node that records topics to an MCAP bag, for systems without ros2 bag."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ from lidar_perception.wire.codec import load_typestore
 from msg_utils.messages import message_class
 
 LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
-DEPTH = 100  # messages of a topic that may wait at DDS while the machine is busy
-MAX_WAITING = 256 * 2**20  # bytes that wait for the file; what comes then is dropped, and counted
-DISCOVERY_PERIOD = 0.2  # seconds between looks for the type of a topic that is not there yet
+DEPTH = 100  # messages of a topic that DDS holds while the machine is busy
+MAX_QUEUED = 256 * 2**20  # bytes that wait for the file; further messages are dropped and counted
+DISCOVERY_PERIOD_S = 0.2  # between searches for topics without a publisher so far
 
 
 class BagRecorder(LidarNode):
-    """Raw bytes from DDS to the file, compressed in a thread of its own. The bag is complete when
-    the node has ended."""
+    """Writes the bytes of messages to a bag, which is complete when the node has ended.
+
+    A separate thread compresses and writes them.
+    """
 
     writes_files = True
 
@@ -35,55 +37,55 @@ class BagRecorder(LidarNode):
         self.writer = BagWriter(self.params.bag)
         self.writer.__enter__()
         self.waiting = list(dict.fromkeys(map(self.resolve_topic_name, self.params.topics)))
-        self.heard: dict[str, Any] = {}
-        self.unheard: set[str] = set()  # topics of which somebody offers less than was asked for
+        self.subscription_by_topic: dict[str, Any] = {}
+        self.incompatible: set[str] = set()  # topics with a publisher of weaker QoS
         self.queue: queue.Queue = queue.Queue()
-        self.put, self.done = 0, 0  # bytes, each counted by one thread
+        self.queued, self.written = 0, 0  # bytes, each counted by one thread
         self.counts.update(lost=0, dropped=0)
-        self.said = 0  # lost or dropped
+        self.reported = 0  # lost and dropped messages
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._write)
         self.thread.start()
-        self.every(DISCOVERY_PERIOD, self._discover)
+        self.add_steady_timer(DISCOVERY_PERIOD_S, self._discover)
         self._discover()
 
     def _discover(self) -> None:
         if self.failure:
-            raise InputError(f"cannot write the bag {self.params.bag}: {self.failure}; what is "
-                             f"written is in {self.writer.partial}")
+            raise InputError(f"cannot write the bag {self.params.bag}: {self.failure}; the part "
+                             f"so far is in {self.writer.partial}")
         types = dict(self.get_topic_names_and_types())
         for topic in [t for t in self.waiting if t in types]:
             offered = [i.qos_profile for i in self.get_publishers_info_by_topic(topic)]
             if not offered:
                 continue
             self.waiting.remove(topic)
-            if (kind := self._known(types[topic][0])) is None:
+            if (kind := self._find_class(types[topic][0])) is None:
                 self.get_logger().warning(f"{topic} is not recorded: {types[topic][0]} is not "
                                           "installed here, or unknown")
                 continue
             self._subscribe(topic, kind)
-            latched = self.heard[topic].qos_profile.durability == LATCHED
+            latched = self.subscription_by_topic[topic].qos_profile.durability == LATCHED
             self.queue.put(("topic", topic, types[topic][0],
                             LATCHED_QOS if latched else SENSOR_QOS))
-        while self.unheard:
-            topic = self.unheard.pop()
-            before = self.heard[topic]
+        while self.incompatible:
+            topic = self.incompatible.pop()
+            before = self.subscription_by_topic[topic]
             self.destroy_subscription(before)
             self._subscribe(topic, before.msg_type)
-        gone = self.counts["lost"] + self.counts["dropped"]
-        if gone > self.said:
-            self.said = gone
+        missing = self.counts["lost"] + self.counts["dropped"]
+        if missing > self.reported:
+            self.reported = missing
             self.report(WARN, f"{self.counts['lost']} messages were lost on the way and "
-                        f"{self.counts['dropped']} dropped, as the file could not be written fast "
-                        "enough: record fewer topics, or on a faster machine")
+                        f"{self.counts['dropped']} dropped, because the disk is too slow: "
+                        "record fewer topics, or use a faster machine")
         elif self.waiting:
             self.report(WARN, f"waiting for {', '.join(self.waiting)}", expected=True)
         else:
             self.report(OK, "recording")
 
     @staticmethod
-    def _known(type_name: str) -> type | None:
-        """The class of a type that can be received and written; None where there is none."""
+    def _find_class(type_name: str) -> type | None:
+        """Return the class of a type that can be received and written, or None."""
         if type_name not in load_typestore().fielddefs:
             return None
         try:
@@ -92,9 +94,9 @@ class BagRecorder(LidarNode):
             return None
 
     def _subscribe(self, topic: str, kind: type) -> None:
-        """As its publishers of now offer it; again when another offers less."""
+        """Subscribe with a QoS that all present publishers match."""
         offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
-        qos = QoSProfile(  # of several publishers each may have latched its own
+        qos = QoSProfile(  # each of several publishers may have latched its own message
             depth=DEPTH,
             reliability=(ReliabilityPolicy.RELIABLE if all(
                 q.reliability == ReliabilityPolicy.RELIABLE for q in offered)
@@ -102,19 +104,19 @@ class BagRecorder(LidarNode):
             durability=(LATCHED if all(q.durability == LATCHED for q in offered)
                         else DurabilityPolicy.VOLATILE))
 
-        def received(data: bytes) -> None:
-            waiting = self.put - self.done
-            if waiting and waiting + len(data) > MAX_WAITING:
+        def enqueue(data: bytes) -> None:
+            waiting = self.queued - self.written
+            if waiting and waiting + len(data) > MAX_QUEUED:
                 self.counts["dropped"] += 1
                 return
             self.counts["frames"] += 1
-            self.put += len(data)
+            self.queued += len(data)
             self.queue.put(("message", topic, self.get_clock().now().nanoseconds, data))
 
-        self.heard[topic] = self.create_subscription(
-            kind, topic, received, qos, raw=True, event_callbacks=SubscriptionEventCallbacks(
+        self.subscription_by_topic[topic] = self.create_subscription(
+            kind, topic, enqueue, qos, raw=True, event_callbacks=SubscriptionEventCallbacks(
                 message_lost=self.count_lost,
-                incompatible_qos=lambda _: self.unheard.add(topic)))
+                incompatible_qos=lambda _: self.incompatible.add(topic)))
 
     def _write(self) -> None:
         try:
@@ -124,7 +126,7 @@ class BagRecorder(LidarNode):
                     self.writer.add_topic(topic, *rest)
                 else:
                     self.writer.write(topic, *rest)
-                    self.done += len(rest[1])
+                    self.written += len(rest[1])
         except Exception as error:  # a full disk; the timer ends the node
             self.failure = error
 
@@ -133,5 +135,5 @@ class BagRecorder(LidarNode):
         self.thread.join()
         try:
             self.writer.__exit__(type(self.failure) if self.failure else None, self.failure, None)
-        except (InputError, OSError) as error:  # the part stays as it is
+        except (InputError, OSError) as error:  # the partial file is kept
             self.get_logger().error(f"{self.writer.partial} is not complete: {error}")

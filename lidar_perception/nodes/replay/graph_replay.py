@@ -1,4 +1,4 @@
-"""Replays a bag through the graph of nodes, each a process of its own; records what they find."""
+"""Replay of a bag through a graph of nodes, with a recording of their results."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from lidar_perception.nodes.graph import (
     FINAL,
     TRACKER,
     Processes,
+    build_graph,
     cloud_topic,
-    evaluation,
-    graph_of,
-    outputs_in_use,
-    private_domain,
-    relative,
-    result_topics,
-    wait_for,
+    configure_evaluator,
+    find_connected_outputs,
+    list_awaited_topics,
+    list_result_topics,
+    relative_name,
+    reserve_domain,
 )
 from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.param_fields import flatten
@@ -33,31 +33,44 @@ from lidar_perception.types import InputError
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
 
 TRACKS = f"/{TRACKER}/output/tracks"
-START_TIMEOUT = 180.0   # seconds for all nodes to compile, come up and find each other
-AHEAD = 2               # clouds at a time, so that one stage works while another does
-SILENCE_TIMEOUT = 10.0  # seconds without a result after the last cloud
+START_TIMEOUT_S = 180.0   # for all nodes to compile, start and find each other
+AHEAD = 2                 # clouds in flight, so that stages can work in parallel
+SILENCE_TIMEOUT_S = 10.0  # without a result after the last cloud
 
 
 def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = "candidates",
            rate: float = 1.0, single: bool = False, real_time: bool = False) -> dict:
-    """How the run of a detector of the graph, with its params, over a bag of `clouds` clouds went:
-    results, latency_ms (from the cloud's arrival in this process to its detections'), memory_mb
-    (proportional set size), slower (how many times slower than asked for it was), and poses:
-    whence the tracker had them, as recorded_source says. With the candidates also the evaluator's
-    scores.
+    """Replay a bag through the graph of a detector and record the results.
 
-    A cloud is sent when those before have their detections, so that none is lost on a slow
-    machine; with real_time they come as from a sensor, whatever becomes of them.
+    The nodes run on a private ROS domain. Logs and the result bag are left in `out`.
 
-    Leaves logs and the result bag in out. The nodes run on a private domain.
+    Args:
+        drive: the bag.
+        clouds: number of clouds in the bag.
+        out: folder for the results.
+        params: parameters of the detector, a dataclass.
+        detector: name of the detector, see graph.DETECTOR_NODES.
+        rate: speed of the replay, 1.0 for real time.
+        single: run the detector in one process.
+        real_time: send clouds at the rate of the sensor. Otherwise a cloud is sent once the clouds
+            before it have detections, so that none is lost on a slow machine.
+
+    Returns:
+        clouds, results (number of frames), latency_ms (median and p95 from the arrival of a cloud
+        in this process to its detections), memory_mb (proportional set size), memory_mb_by_node,
+        slower (slowdown of the replay against `rate`), poses (their source for the tracker, see
+        recorded_source), and for candidates the scores of the evaluator.
+
+    Raises:
+        InputError: the nodes do not connect, or there is no result.
     """
     use_large_shared_memory()
-    from lidar_perception.nodes.watch import Watch
+    from lidar_perception.nodes.external_node import GraphMonitor
 
-    graph = graph_of([detector], single, tracking=True)
-    stages = result_topics(single, detector)
+    graph = build_graph([detector], single, tracking=True)
+    stages = list_result_topics(single, detector)
     topics = {**stages, "tracks": TRACKS}
-    domain = private_domain()
+    domain = reserve_domain()
     with Bag(drive) as bag:
         poses = recorded_source(ODOMETRY in bag.topics)
     scores = out / "logs" / "scores.json"
@@ -66,26 +79,29 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         node: (remap, settings) for node, remap in graph.items()}
     nodes[TRACKER] = graph[TRACKER], {
         "ego.source": "odometry" if poses == "recording" else poses,
-        **({} if real_time else {"ego.max_wait": SILENCE_TIMEOUT})}
+        **({} if real_time else {"ego.max_wait": SILENCE_TIMEOUT_S})}
     if scored := detector == "candidates":
-        nodes["evaluator"] = evaluation(scores.resolve(), single)
+        nodes["evaluator"] = configure_evaluator(scores.resolve(), single)
     recorded = [cloud_topic(single, detector), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
     nodes["bag_recorder"] = {}, {"bag": str((out / "result").resolve()), "topics": recorded}
-    with Processes(out / "logs", domain) as processes, Watch(domain, stages[FINAL]) as watch:
+    with (Processes(out / "logs", domain) as processes,
+          GraphMonitor(domain, stages[FINAL]) as monitor):
         for node, (remap, values) in nodes.items():
             processes.start(node, remap, values)
-        outputs = outputs_in_use({node: remap for node, (remap, _) in nodes.items()})
+        outputs = find_connected_outputs({node: remap for node, (remap, _) in nodes.items()})
         with errors.status("starting the nodes"):
-            ready = watch.until(lambda: watch.connected(outputs), START_TIMEOUT, processes.check)
+            ready = monitor.spin_until(lambda: monitor.is_connected(outputs), START_TIMEOUT_S,
+                                       processes.check)
         if not ready:
-            raise InputError(f"the nodes did not find each other in {START_TIMEOUT:.0f} s: "
-                             f"{list(watch.diagnostics) or 'none'} reported; see {out}/logs")
-        # The watch hears the clouds too, as the tracker and the recorder may, and the recorder
-        # the labels.
-        clouds_heard = 2 + (poses == "kiss_icp") + (POINTS in recorded)
-        rules = wait_for(single, clouds_heard, 1 + 2 * scored, detector)
-        rules += [f"{relative(stages[FINAL])}:={3 + scored}"]  # watch, recorder, tracker, evaluator
-        rules += [relative(ODOMETRY)] if poses == "recording" else []
+            raise InputError(f"the nodes did not find each other in {START_TIMEOUT_S:.0f} s: "
+                             f"{list(monitor.diagnostics) or 'none'} reported; see {out}/logs")
+        # Besides the graph, the monitor subscribes to the clouds, and the tracker and the recorder
+        # may; the recorder also subscribes to the labels.
+        cloud_subscribers = 2 + (poses == "kiss_icp") + (POINTS in recorded)
+        rules = list_awaited_topics(single, cloud_subscribers, 1 + 2 * scored, detector)
+        # The detections have four subscribers: monitor, recorder, tracker, evaluator.
+        rules += [f"{relative_name(stages[FINAL])}:={3 + scored}"]
+        rules += [relative_name(ODOMETRY)] if poses == "recording" else []
         processes.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
                                            "wait_for": rules,
                                            "follow": [] if real_time else [stages[FINAL]],
@@ -95,29 +111,30 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
             before = -1
 
             def finished() -> bool:
-                bar.update(task, completed=watch.frames)
-                return watch.frames >= clouds
+                bar.update(task, completed=monitor.frames)
+                return monitor.frames >= clouds
 
-            while not finished() and (watch.frames != before
-                                      or not processes.ended("bag_player")):
-                before = watch.frames
-                watch.until(finished, SILENCE_TIMEOUT, lambda: processes.check("bag_player"))
-        # These are behind the results by as much as their own work takes.
+            while not finished() and (monitor.frames != before
+                                      or not processes.has_ended("bag_player")):
+                before = monitor.frames
+                monitor.spin_until(finished, SILENCE_TIMEOUT_S,
+                                   lambda: processes.check("bag_player"))
+        # Both lag behind the results by their own processing time.
         def caught_up(node: str) -> bool:
-            return int(watch.value_of(node, "frames") or 0) >= watch.frames
+            return int(monitor.get_value(node, "frames") or 0) >= monitor.frames
 
         for node in {"evaluator", TRACKER} & nodes.keys():
-            watch.until(partial(caught_up, node), SILENCE_TIMEOUT)
+            monitor.spin_until(partial(caught_up, node), SILENCE_TIMEOUT_S)
         memory = processes.memory_mb()
         codes = processes.stop(timeout=30)
     if failed := {node: code for node, code in codes.items() if code}:
         errors.print(Text(f"exit codes {failed}", "red") + f"; see {out}/logs")
-    if watch.frames == 0:
+    if monitor.frames == 0:
         raise InputError(f"no cloud of {drive} gave a result; see {out}/logs")
-    latencies = sorted(watch.latencies_ms) or [0.0]
+    latencies = sorted(monitor.latencies_ms) or [0.0]
     return {**(json.loads(scores.read_text()) if scored else {}),
-            "clouds": clouds, "results": watch.frames,
+            "clouds": clouds, "results": monitor.frames,
             "latency_ms": {"median": median(latencies),
                            "p95": latencies[int(0.95 * (len(latencies) - 1))]},
-            "slower": float(watch.value_of("bag_player", "slower") or 1.0),
+            "slower": float(monitor.get_value("bag_player", "slower") or 1.0),
             "memory_mb": sum(memory.values()), "memory_mb_by_node": memory, "poses": poses}

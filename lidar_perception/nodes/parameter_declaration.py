@@ -1,4 +1,4 @@
-"""Parameters of a dataclass as ROS parameters: types, ranges, texts; 1 is taken for 1.0."""
+"""Declaration of dataclass fields as ROS parameters with types, ranges and descriptions."""
 
 from __future__ import annotations
 
@@ -8,51 +8,54 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from lidar_perception.nodes.rclpy_compat import parameter_overrides, store_empty_list
 from lidar_perception.param_fields import collect_fields, with_values
 
 TYPES = {bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE,
          str: Parameter.Type.STRING}
 LISTS = {int: Parameter.Type.INTEGER_ARRAY, float: Parameter.Type.DOUBLE_ARRAY,
          str: Parameter.Type.STRING_ARRAY}
-# What is given, what is declared -> the value as declared.
-AS_FLOATS: dict[tuple[Any, Any], Any] = {
+# (given type, declared type) -> conversion of the value.
+TO_FLOATS: dict[tuple[Any, Any], Any] = {
     (Parameter.Type.INTEGER, Parameter.Type.DOUBLE): float,
     (Parameter.Type.INTEGER_ARRAY, Parameter.Type.DOUBLE_ARRAY): lambda v: [*map(float, v)],
 }
 
 
-def declare(node: Node, params: Any) -> Any:
-    """Declare the fields of params, a dataclass, and return params with the values that the node
-    was given.
+def declare_parameters(node: Node, params: Any) -> Any:
+    """Declare the fields of a dataclass as ROS parameters of a node.
 
-    Raises: ValueError for a value out of range."""
-    declared = {}
+    Returns:
+        params with the values that the user has set.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
+    declared, overrides = {}, parameter_overrides(node)
     for name, f in collect_fields(params).items():
         kind = _kind(f)
         value = list(f.default) if isinstance(f.default, tuple) else f.default
-        if name in node._parameter_overrides:
-            given = as_declared(node._parameter_overrides.pop(name), kind)
+        if name in overrides:
+            given = convert_to_declared_type(overrides.pop(name), kind)
             if given.value == []:
                 value = []
             else:
-                node._parameter_overrides[name] = given
+                overrides[name] = given
         declared[name] = node.declare_parameter(name, kind if value == [] else value,
                                                 _descriptor(f, kind)).value
         if declared[name] is None:
-            # rclpy takes an empty list for one of bytes, and what is declared by its type alone is
-            # "not set", which get_parameters answers with nothing at all for all of its names.
-            node._parameters[name] = Parameter(name, kind, [])
+            store_empty_list(node, name, kind)
             declared[name] = []
     return with_values(params, declared)
 
 
-def as_declared(given: Parameter, kind: Parameter.Type) -> Parameter:
-    """Whole numbers as floats where the declared type is float, and an empty list, which has no
-    type, as one of the declared type; all else as given."""
+def convert_to_declared_type(given: Parameter, kind: Parameter.Type) -> Parameter:
+    """Return a parameter with integers converted to float where the declared type is float, and
+    with an empty list, which has no type, converted to the declared type."""
     if kind in LISTS.values() and (given.type_ == Parameter.Type.NOT_SET or (
             given.type_.name.endswith("_ARRAY") and len(given.value) == 0)):
         return Parameter(given.name, kind, [])
-    convert = AS_FLOATS.get((given.type_, kind))
+    convert = TO_FLOATS.get((given.type_, kind))
     return Parameter(given.name, kind, convert(given.value)) if convert else given
 
 

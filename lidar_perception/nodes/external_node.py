@@ -1,4 +1,4 @@
-"""Watches a running graph from outside: is it connected, how far is it, how long does it take."""
+"""ROS nodes for programs that start and observe other nodes."""
 
 from __future__ import annotations
 
@@ -23,60 +23,71 @@ from lidar_perception.nodes.runtime import RELIABLE, SENSOR_DATA
 from lidar_perception.wire.topics import POINTS
 
 DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-STILL, STILL_AT_LAST = 0.1, 3.0  # seconds
+SETTLE_S, MAX_SETTLE_S = 0.1, 3.0  # seconds
 
 
-def new_context(domain: int | None) -> Context:
-    """A ROS context of its own, without signal handlers, on a domain; None is that of the
-    environment. leave() ends it."""
+def create_context(domain: int | None) -> Context:
+    """Create a ROS context without signal handlers, to be ended by shut_down_context().
+
+    Args:
+        domain: ROS domain; None for that of the environment.
+    """
     context = Context()
     rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     return context
 
 
-def parameters_of(values: Mapping[str, Any]) -> list[Parameter]:
-    """What sets parameters of these names to these values."""
+def to_parameters(values: Mapping[str, Any]) -> list[Parameter]:
+    """Convert {name: value} to rclpy parameters."""
     return [Parameter(name, value=value) for name, value in values.items()]
 
 
-def values_of(answers: Iterable[Any]) -> list[Any]:
-    """The values in a node's answers to get_parameters."""
+def to_values(answers: Iterable[Any]) -> list[Any]:
+    """Convert the parameter messages in an answer of get_parameters to Python values."""
     return [parameter_value_to_python(answer) for answer in answers]
 
 
-def leave(context: Context, *nodes: Node) -> None:
-    """Destroy nodes, all that the context has, and end it, once nobody has come or gone for STILL
-    seconds, or after STILL_AT_LAST.
+def shut_down_context(context: Context, *nodes: Node) -> None:
+    """Destroy all nodes of a context and shut it down once the ROS graph has settled.
 
-    Fast DDS as in the wheels may wait for ever, with the interpreter's lock held, if the last node
-    of a context is destroyed in the moment in which it hears that another process leaves
+    The graph has settled after SETTLE_S seconds without a change, at the latest after MAX_SETTLE_S.
+    Fast DDS as in the wheels may deadlock, with the interpreter lock held, if the last node of a
+    context is destroyed while Fast DDS learns that another process leaves
     (https://github.com/eProsima/Fast-DDS/issues/6513).
     """
     if nodes:
-        end, since, seen = monotonic() + STILL_AT_LAST, monotonic(), _others(nodes[0])
-        while (now := monotonic()) < min(end, since + STILL):
-            sleep(STILL / 10)
-            if seen != (seen := _others(nodes[0])):
+        end, since, seen = monotonic() + MAX_SETTLE_S, monotonic(), _graph_state(nodes[0])
+        while (now := monotonic()) < min(end, since + SETTLE_S):
+            sleep(SETTLE_S / 10)
+            if seen != (seen := _graph_state(nodes[0])):
                 since = now
     for node in nodes:
         node.destroy_node()
     context.try_shutdown()
 
 
-def _others(node: Node) -> tuple[Any, ...]:
-    """Who is on the domain, and how many publish and subscribe to each topic."""
+def _graph_state(node: Node) -> tuple[Any, ...]:
+    """Return the nodes on the domain, and the numbers of endpoints of each topic."""
     return (sorted(node.get_node_names_and_namespaces()),
             [(topic, node.count_publishers(topic), node.count_subscribers(topic))
              for topic, _ in node.get_topic_names_and_types()])
 
 
-class Outside:
-    """A node of a program that starts other nodes: a ROS context of its own, spun by hand, no
-    signal handlers; on a domain, None for that of the environment. A context manager. diagnostics
-    holds the last status of every node."""
+class ExternalNode:
+    """Context manager for a node in a program that starts or observes other nodes.
+
+    The node has its own ROS context without signal handlers and is spun by spin_until().
+
+    Args:
+        domain: ROS domain; None for that of the environment.
+        name: name of the node.
+
+    Attributes:
+        diagnostics: {node: its last DiagnosticStatus}
+    """
 
     def __init__(self, domain: int | None, name: str):
-        self.context = new_context(domain)
+        self.context = create_context(domain)
         self.node = rclpy.create_node(name, context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
@@ -88,46 +99,47 @@ class Outside:
 
     def __exit__(self, *_: Any) -> None:
         self.executor.shutdown()
-        leave(self.context, self.node)
+        shut_down_context(self.context, self.node)
 
     def _on_status(self, msg: Any) -> None:
         for status in msg.status:
             self.diagnostics[status.name] = status
 
-    def message_of(self, node: str) -> str:
-        """The node's last diagnostic message, '' before the first."""
+    def get_message(self, node: str) -> str:
+        """Return the last diagnostic message of a node, "" before the first one."""
         return self.diagnostics[node].message if node in self.diagnostics else ""
 
-    def value_of(self, node: str, key: str) -> str | None:
-        """A value of the node's last diagnostic; None where there is none."""
+    def get_value(self, node: str, key: str) -> str | None:
+        """Return a value of the last diagnostic of a node, or None."""
         status = self.diagnostics.get(node)
         return next((v.value for v in status.values if v.key == key), None) if status else None
 
-    def connected(self, outputs: Mapping[str, set[str]]) -> bool:
-        """True once every node has said by its diagnostics that somebody listens to each of its
-        outputs in use."""
+    def is_connected(self, outputs: Mapping[str, set[str]]) -> bool:
+        """Return True if by the diagnostics each of the outputs {node: topics} has a subscriber."""
         return all(node in self.diagnostics and all(
-            int(self.value_of(node, f"subscribers of {topic}") or 0) for topic in topics)
+            int(self.get_value(node, f"subscribers of {topic}") or 0) for topic in topics)
             for node, topics in outputs.items())
 
-    def until(self, condition: Callable[[], Any], timeout: float,
-              each: Callable[[], None] = lambda: None) -> bool:
-        """Spin until condition() holds (True) or timeout seconds have gone by (False); each() is
-        called again and again."""
+    def spin_until(self, condition: Callable[[], Any], timeout: float,
+                   on_spin: Callable[[], None] = lambda: None) -> bool:
+        """Spin until condition() holds; return False if it does not within timeout seconds.
+
+        on_spin() is called before each spin.
+        """
         end = monotonic() + timeout
         while not condition():
             if monotonic() > end:
                 return False
-            each()
+            on_spin()
             self.executor.spin_once(timeout_sec=0.02)
         return True
 
 
-class Watch(Outside):
-    """How far a running graph is: results, and their latency."""
+class GraphMonitor(ExternalNode):
+    """Counts the results of a running graph and measures their latency."""
 
     def __init__(self, domain: int, detections: str):
-        with _localhost():
+        with _localhost_discovery():
             super().__init__(domain, "watch")
         self.sent: dict[bytes, float] = {}
         self.latencies_ms: list[float] = []
@@ -147,8 +159,8 @@ class Watch(Outside):
 
 
 @contextmanager
-def _localhost():
-    """ROS reads the range of discovery from the environment when a context is made."""
+def _localhost_discovery():
+    """Limit discovery to this machine for contexts that are created inside."""
     before = os.environ.get(DISCOVERY_RANGE)
     os.environ[DISCOVERY_RANGE] = "LOCALHOST"
     yield

@@ -1,0 +1,43 @@
+"""Parameters of all nodes, and the detection of misspelt parameter names."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable
+from difflib import get_close_matches
+from itertools import islice
+from typing import Any
+
+from lidar_perception.nodes import NODES
+from lidar_perception.param_fields import collect_fields
+
+MIN_SIMILARITY = 0.85  # 0..1, ratio of difflib above which a name is a misspelling
+MAX_NAMES = 200        # that are checked
+
+
+def find_node_parameters(name: str) -> dict[str, Any]:
+    """Return {parameter of a node: its dataclass field, with the default of the node}."""
+    fields: dict[str, Any] = {}
+    for path in NODES[name][1:]:
+        module, _, params = path.rpartition(".")
+        defaults = getattr(importlib.import_module(f"lidar_perception.{module}"), params)()
+        fields |= collect_fields(defaults)
+    return fields
+
+
+def describe_misspelt_parameters(names: Iterable[str]) -> list[str]:
+    """Return a line for each parameter name that is close to one of ours, or in one of our groups.
+
+    Other unknown names may belong to other packages with parameters in the same file.
+    """
+    if not (names := [*islice(names, MAX_NAMES)]):
+        return []
+    known = {name for node in NODES for name in find_node_parameters(node)}
+    groups = {name.partition(".")[0] for name in known if "." in name}
+    lines = []
+    for name in names:
+        matches = get_close_matches(name, known, 1, MIN_SIMILARITY)
+        if name not in known and (matches or (name.partition(".")[0] in groups and "." in name)):
+            lines.append(f"no node has a parameter {name[:80]!r}, so it changes nothing"
+                         + (f"; is '{matches[0]}' meant?" if matches else "; --help lists all"))
+    return lines
