@@ -560,7 +560,7 @@ def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch,
     (["run", "fused"], "did you mean 'fused_detector'?"),
     (["convert", "a", "--out", "b", "--limit", "0"], "0 is not in the range"),
     (["convert", "a"], "--out"),
-    (["simulate", "--frames", "1", "--out", "."], "no name for something new"),
+    (["simulate", "--frames", "1", "--out", "."], "no name for a new file"),
     (["run", "bogus"], "'bogus'"),
 ])
 def test_a_command_that_cannot_be_used_is_exit_code_2(arguments, words, monkeypatch, capsys):
