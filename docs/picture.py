@@ -19,9 +19,9 @@ from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.rendering.canvas import Canvas
-from lidar_perception.rendering.colors import BACKGROUND, by_cluster
+from lidar_perception.rendering.colors import BACKGROUND, color_by_cluster
 from lidar_perception.rendering.files import write_png
-from lidar_perception.rendering.picture import Boxes, Stage, draw_view, highlighted
+from lidar_perception.rendering.picture import Boxes, Stage, draw_view, highlight_points
 from lidar_perception.rendering.views import Perspective
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.scene import Scenes
@@ -41,7 +41,8 @@ def draw(path: Path, view: Perspective, xyz: np.ndarray, colors: np.ndarray,
     """Draw a cloud with boxes, without texts."""
     boxes = Boxes(found.boxes, found.class_ids)
     canvas = Canvas(view.width, view.height, BACKGROUND)
-    draw_view(canvas, view, Stage(50.0, True, -1.73), xyz, highlighted(colors, xyz, boxes), boxes)
+    colors = highlight_points(colors, xyz, boxes)
+    draw_view(canvas, view, Stage(50.0, True, -1.73), xyz, colors, boxes)
     write_png(path, np.asarray(Image.fromarray(canvas.pixels).reduce(FINER)))
 
 
@@ -65,12 +66,12 @@ def make(folder: Path = FOLDER) -> None:
     ground = segment_ground(frame, params.ground)
     cluster_ids = np.zeros(len(frame), np.int32)
     cluster_ids[~ground] = cluster(frame.xyz[~ground], params.clustering)
-    draw(folder / "scene.png", README, frame.xyz, by_cluster(ground, cluster_ids), found)
+    draw(folder / "scene.png", README, frame.xyz, color_by_cluster(ground, cluster_ids), found)
 
     # The displays that are on in the layouts: clusters, the ground, detections and candidates.
     segmented, candidates = find_candidates(frame, make_fixed_source(load_seed(
         PipelineParams().seed.file)))
-    draw(folder / "look.png", LOOK, segmented.xyz, by_cluster(
+    draw(folder / "look.png", LOOK, segmented.xyz, color_by_cluster(
         segmented.ground, segmented.cluster_ids), found.followed_by(candidates.final))
     draw_detect(folder / "detect.png")
 

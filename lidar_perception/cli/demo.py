@@ -252,7 +252,7 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
                height: float) -> bool:
     """Draw the recorded frame with most hits, and its tracks; return False without labels."""
     from lidar_perception.nodes.replay.graph_replay import TRACKS
-    from lidar_perception.rendering.colors import by_cluster
+    from lidar_perception.rendering.colors import color_by_cluster
     from lidar_perception.rendering.files import write_png
     from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
     hits = {stamp: (len(match_centres(found.boxes, truth)[0]), len(truth))
@@ -276,7 +276,7 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
     ground = read_column(drawing, "ground", indices)
     ids = read_column(drawing, "cluster_id", indices)
     none = np.zeros(len(frame), int)
-    colors = None if ground is None else by_cluster(
+    colors = None if ground is None else color_by_cluster(
         ground > 0, none if ids is None else renumber_ids(ids)[0])
     boxes = Boxes(found.boxes, np.array(class_ids(found.labels), int),
                   [str(i) if trails else "" for i in found.ids],

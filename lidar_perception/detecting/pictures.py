@@ -11,7 +11,7 @@ import numpy as np
 
 from lidar_perception.detecting.formats import Run
 from lidar_perception.detecting.results import FrameResult
-from lidar_perception.rendering.files import Film, film, png_note, write_png
+from lidar_perception.rendering.files import Film, open_film, read_png_note, write_png
 from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
 
 PERIOD_S = 0.1  # of a picture without a next one
@@ -97,7 +97,7 @@ class Pictures:
         """Draw a frame and write its picture."""
         path = self.path / f"{result.frame.name}.png"
         stage = repr(self.drawer.stage_of(result))
-        if png_note(path) != stage:
+        if read_png_note(path) != stage:
             write_png(path, self.drawer(result), stage)
 
 
@@ -108,7 +108,7 @@ class FilmOfFrames:
 
     def __init__(self, run: Run, drawer: FrameDrawer, path: Path) -> None:
         self.drawer, self.path = drawer, path
-        self._writing: AbstractContextManager[Film] = film(path, drawer.size)
+        self._writing: AbstractContextManager[Film] = open_film(path, drawer.size)
         self._last: tuple[int, np.ndarray] | None = None  # stamp and picture
 
     def __enter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""Colours of points and boxes on a dark ground."""
+"""Colours of points and boxes on a dark background."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from lidar_perception.types import CLASSES
 from msg_utils.markers import COLORS, OTHER_COLOR
 
 BACKGROUND = np.array([11, 15, 24], np.uint8)
-LABEL = (235, 240, 245)  # of labelled boxes, which are dashed
+LABEL = (235, 240, 245)  # labelled boxes, which are dashed
 TEXT, DIM = (225, 230, 238), (130, 142, 160)
 GRID = (38, 47, 64)
-# Of the classes that are detected; the others are as bright as the colours of their markers can be.
+# Other classes have the brightest possible colour of their markers.
 DETECTED_COLORS = dict(zip(DETECTED, ((64, 186, 255), (255, 104, 80), (255, 212, 66))))
-# From the ground up, metres: dull where there is nothing to find, light at the height of roofs.
+# Metres above the ground: dull at the ground, light at the height of roofs.
 HEIGHTS = (-0.3, 0.15, 0.9, 1.8, 3.5, 7.0)
 HEIGHT_COLORS = np.array([[46, 66, 106], [70, 96, 142], [76, 140, 166], [126, 190, 184],
                           [206, 216, 190], [224, 200, 210]], np.float32)
-GROUND_COLOR, REST_COLOR = np.array([[92, 120, 158], [140, 153, 173]], np.uint8)
+GROUND_COLOR, UNCLUSTERED_COLOR = np.array([[92, 120, 158], [140, 153, 173]], np.uint8)
 CLUSTER_COLORS = np.array([  # muted, so that boxes stand out
     [143, 120, 219], [84, 166, 158], [209, 143, 168], [128, 173, 97], [97, 143, 217],
     [204, 166, 107], [173, 107, 173], [107, 179, 204], [194, 128, 112], [148, 158, 117]], np.uint8)
@@ -27,35 +27,35 @@ INTENSITY_COLORS = np.array([[38, 52, 84], [74, 104, 150], [140, 180, 190], [250
                             np.float32)
 
 
-def by_height(heights: np.ndarray) -> np.ndarray:
-    """Return (N, 3) uint8 colours of points at these heights (N,) above the ground, metres."""
-    return _ramp(heights, HEIGHTS, HEIGHT_COLORS)
+def color_by_height(heights: np.ndarray) -> np.ndarray:
+    """Return colours (N, 3) uint8 for points at heights (N,) above the ground in metres."""
+    return _interpolate(heights, HEIGHTS, HEIGHT_COLORS)
 
 
-def by_intensity(intensity: np.ndarray) -> np.ndarray:
-    """Return (N, 3) uint8 colours of intensities (N,), 0..1."""
-    return _ramp(intensity, INTENSITIES, INTENSITY_COLORS)
+def color_by_intensity(intensity: np.ndarray) -> np.ndarray:
+    """Return colours (N, 3) uint8 for intensities (N,), 0..1."""
+    return _interpolate(intensity, INTENSITIES, INTENSITY_COLORS)
 
 
-def by_cluster(ground: np.ndarray, cluster_ids: np.ndarray) -> np.ndarray:
-    """Return (N, 3) uint8 colours of points: ground (N,) bool, and clusters (N,) int, 0 none, whose
-    neighbouring ids have different colours."""
-    colors = np.where(ground[:, None], GROUND_COLOR, REST_COLOR)
+def color_by_cluster(ground: np.ndarray, cluster_ids: np.ndarray) -> np.ndarray:
+    """Return colours (N, 3) uint8 by ground (N,) bool and cluster_ids (N,) int, 0 = none.
+    Consecutive ids have different colours."""
+    colors = np.where(ground[:, None], GROUND_COLOR, UNCLUSTERED_COLOR)
     clustered = (cluster_ids > 0) & ~ground
     colors[clustered] = CLUSTER_COLORS[cluster_ids[clustered] * 7 % len(CLUSTER_COLORS)]
     return colors
 
 
-def _ramp(values: np.ndarray, stops: tuple[float, ...], colors: np.ndarray) -> np.ndarray:
-    """Colours between those at the stops, from a table of 256."""
+def _interpolate(values: np.ndarray, stops: tuple[float, ...], colors: np.ndarray) -> np.ndarray:
+    """Interpolate between the colours at the stops, with a table of 256 values."""
     steps = np.linspace(stops[0], stops[-1], 256)
     table = np.stack([np.interp(steps, stops, colors[:, c]) for c in range(3)], axis=1)
-    share = (np.asarray(values, np.float32) - stops[0]) / (stops[-1] - stops[0])
-    return table.astype(np.uint8)[np.clip(share * 255, 0, 255).astype(np.uint8)]
+    position = (np.asarray(values, np.float32) - stops[0]) / (stops[-1] - stops[0])
+    return table.astype(np.uint8)[np.clip(position * 255, 0, 255).astype(np.uint8)]
 
 
-def class_color(class_id: int) -> tuple[int, int, int]:
-    """Return the colour of a class."""
+def get_class_color(class_id: int) -> tuple[int, int, int]:
+    """Return the colour r g b of a class, 0..255."""
     name = CLASSES[class_id]
     if name in DETECTED_COLORS:
         return DETECTED_COLORS[name]

@@ -1,4 +1,4 @@
-"""Pictures and films as files: PNG, GIF and WebP by Pillow; MP4 by PyAV, the extra [video]."""
+"""Writing of pictures and films: PNG, GIF and WebP with Pillow, MP4 with PyAV (extra [video])."""
 
 from __future__ import annotations
 
@@ -16,25 +16,28 @@ from PIL import Image, PngImagePlugin
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import InputError
 
-ENCODED, ANIMATED = (".mp4", ".mkv", ".mov"), (".gif", ".webp")
+VIDEO_SUFFIXES, ANIMATION_SUFFIXES = (".mp4", ".mkv", ".mov"), (".gif", ".webp")
 ANIMATED_WIDTH = 960   # pixels
-MAX_ANIMATED = 300     # pictures of an animation, which is made in memory
-TICKS = 1000           # a second
+MAX_ANIMATED = 300     # pictures of an animation, which is held in memory
+TICKS = 1000           # per second
 PNG_KEY, PNG_LEVEL = "lidar_perception", 3
 QUALITY = {"crf": "20", "preset": "veryfast"}
 
 
 def write_png(path: Path, picture: np.ndarray, note: str = "") -> None:
-    """Write a picture (height, width, 3) uint8 with a note that png_note() reads. InputError where
-    it cannot be written."""
+    """Write a picture (height, width, 3) uint8 with a note for read_png_note().
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     info, stream = PngImagePlugin.PngInfo(), io.BytesIO()
     info.add_text(PNG_KEY, note)
     Image.fromarray(picture).save(stream, "png", pnginfo=info, compress_level=PNG_LEVEL)
     write_bytes(path, stream.getbuffer())
 
 
-def png_note(path: Path) -> str | None:
-    """Return the note of a picture that write_png wrote; None where there is none."""
+def read_png_note(path: Path) -> str | None:
+    """Return the note in a picture of write_png; None without one."""
     try:
         with Image.open(path) as image:
             return image.info.get(PNG_KEY)
@@ -46,30 +49,35 @@ class Film(Protocol):
     """A film that is being written."""
 
     def add(self, picture: np.ndarray, seconds: float) -> None:
-        """Add a picture (height, width, 3) uint8 with its duration."""
+        """Add a picture (height, width, 3) uint8 that is shown for `seconds`."""
 
 
 def check_film(path: Path, count: int) -> None:
     """Raise InputError if a film of `count` pictures cannot be written to a path."""
-    if path.suffix not in (*ENCODED, *ANIMATED):
-        raise InputError(f"{path} is not a film: its name must end with one of "
-                         f"{', '.join((*ENCODED, *ANIMATED))}")
-    if path.suffix in ENCODED and importlib.util.find_spec("av") is None:
-        raise InputError(f"{path} needs PyAV: pip install 'lidar_perception[video]', or give a "
-                         "name that ends with .gif or .webp")
-    if path.suffix in ANIMATED and count > MAX_ANIMATED:
-        raise InputError(f"{path} would have {count} pictures, and {path.suffix} files are made of "
-                         f"{MAX_ANIMATED} at most; give --limit, or a name that ends with .mp4")
+    if path.suffix not in (*VIDEO_SUFFIXES, *ANIMATION_SUFFIXES):
+        raise InputError(f"{path} is not a film: its name must end in one of "
+                         f"{', '.join((*VIDEO_SUFFIXES, *ANIMATION_SUFFIXES))}")
+    if path.suffix in VIDEO_SUFFIXES and importlib.util.find_spec("av") is None:
+        raise InputError(f"{path} needs PyAV: pip install 'lidar_perception[video]', or use a "
+                         "name that ends in .gif or .webp")
+    if path.suffix in ANIMATION_SUFFIXES and count > MAX_ANIMATED:
+        raise InputError(f"{path} would have {count} pictures, and {path.suffix} files have at "
+                         f"most {MAX_ANIMATED}; use --limit, or a name that ends in .mp4")
 
 
 @contextmanager
-def film(path: Path, size: tuple[int, int]) -> Iterator[Film]:
-    """Write a film of pictures of a size (width, height); the file appears when it is complete, and
-    not at all without a picture. InputError where it cannot be written."""
+def open_film(path: Path, size: tuple[int, int]) -> Iterator[Film]:
+    """Open a film of pictures of a size (width, height) for writing. The file appears when it is
+    complete; without a picture there is none.
+
+    Raises:
+        InputError: the film cannot be written.
+    """
     partial = path.with_name(f".{path.stem}.incomplete{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        writer: Any = _Encoded(partial, size) if path.suffix in ENCODED else _Animated(partial)
+        writer: Any = (_Video(partial, size) if path.suffix in VIDEO_SUFFIXES
+                       else _Animation(partial))
         yield writer
         if writer.ticks:
             writer.close()
@@ -80,8 +88,8 @@ def film(path: Path, size: tuple[int, int]) -> Iterator[Film]:
         partial.unlink(missing_ok=True)
 
 
-class _Encoded:
-    """H.264. Its pictures have even sides."""
+class _Video:
+    """H.264; width and height of its pictures are cut to even numbers."""
 
     def __init__(self, path: Path, size: tuple[int, int]) -> None:
         import av
@@ -105,8 +113,8 @@ class _Encoded:
         self.container.close()
 
 
-class _Animated:
-    """GIF or WebP, which Pillow writes at once."""
+class _Animation:
+    """GIF or WebP, which Pillow writes in one call."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.ticks = path, 0
@@ -125,4 +133,4 @@ class _Animated:
     def close(self) -> None:
         first, *others = self.pictures
         first.save(self.path, save_all=True, append_images=others, duration=self.durations, loop=0,
-                   quality=80)  # which GIF has not
+                   quality=80)  # ignored by GIF

@@ -1,4 +1,4 @@
-"""Where the eye is: from metres in the LiDAR frame to pixels."""
+"""Projections from the LiDAR frame in metres to pixels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-NEAR = 0.3  # metres ahead of the eye; nothing nearer is drawn
+NEAR = 0.3  # metres; nothing nearer to the eye is drawn
 
 
 class View(Protocol):
@@ -21,8 +21,8 @@ class View(Protocol):
     def height(self) -> int: ...
 
     def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return pixels (..., 2), column and row, and the depth (...) of points (..., 3). Those
-        with a depth below NEAR cannot be drawn."""
+        """Return pixels (..., 2), column and row, and depths (...) of points (..., 3). Points with
+        a depth below NEAR cannot be drawn."""
 
     def radius(self, depth: np.ndarray) -> np.ndarray:
         """Return the radius in pixels of points at these depths."""
@@ -30,8 +30,14 @@ class View(Protocol):
 
 @dataclass(frozen=True)
 class Perspective:
-    """A pinhole camera. eye, target: metres in the LiDAR frame; fov: degrees from left to right;
-    point: metres, the radius of a point."""
+    """A pinhole camera.
+
+    Attributes:
+        eye, target: position and viewed point in the LiDAR frame, metres.
+        fov: horizontal field of view in degrees.
+        width, height: pixels.
+        point: radius of a point in metres.
+    """
 
     eye: tuple[float, float, float]
     target: tuple[float, float, float]
@@ -47,7 +53,7 @@ class Perspective:
 
     @cached_property
     def axes(self) -> np.ndarray:
-        """(3, 3): its columns are right and down, a focal length long, and ahead."""
+        """(3, 3) columns right and down, scaled by the focal length, and ahead."""
         ahead = np.subtract(self.target, self.eye)
         ahead /= np.linalg.norm(ahead)
         right = np.cross(ahead, [0.0, 0.0, 1.0])
@@ -56,9 +62,9 @@ class Perspective:
 
     def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         axes = self.axes
-        seen = xyz @ axes.astype(xyz.dtype) - (self.eye @ axes).astype(xyz.dtype)
-        depth = seen[..., 2]
-        pixels = seen[..., :2] / np.maximum(depth, NEAR)[..., None]
+        camera = xyz @ axes.astype(xyz.dtype) - (self.eye @ axes).astype(xyz.dtype)
+        depth = camera[..., 2]
+        pixels = camera[..., :2] / np.maximum(depth, NEAR)[..., None]
         pixels += np.array([self.width / 2, self.height / 2], xyz.dtype)
         return pixels, depth
 
@@ -68,13 +74,19 @@ class Perspective:
 
 @dataclass(frozen=True)
 class BirdsEye:
-    """From above, x up and y to the left. centre: metres, in the middle; scale: pixels a metre."""
+    """Bird's-eye view, x up and y to the left.
+
+    Attributes:
+        centre: x and y in the middle of the image, metres.
+        scale: pixels per metre.
+        above: height of the eye in metres.
+    """
 
     centre: tuple[float, float]
     scale: float
     width: int
     height: int
-    above: float = 1000.0  # metres, of the eye
+    above: float = 1000.0
 
     def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         middle = [self.width / 2 + self.centre[1] * self.scale,
@@ -86,8 +98,8 @@ class BirdsEye:
         return np.full(np.shape(depth), 0.75)
 
 
-def before_eye(view: View, lines: np.ndarray) -> np.ndarray:
-    """Return segments (S, 2, 2) in pixels of the parts of lines (S, 2, 3) that lie before the eye;
+def project_lines(view: View, lines: np.ndarray) -> np.ndarray:
+    """Project lines (S, 2, 3) to segments (S, 2, 2) in pixels, cut where they pass behind the eye;
     NaN for lines behind it."""
     pixels, depth = view.project(lines)
     behind = depth < NEAR

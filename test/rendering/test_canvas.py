@@ -1,4 +1,4 @@
-"""The canvas compared with slow references, and films."""
+"""The canvas compared with slow reference implementations, and films."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lidar_perception.rendering.canvas import Canvas, Text
-from lidar_perception.rendering.files import MAX_ANIMATED, check_film, film
-from lidar_perception.rendering.views import NEAR, BirdsEye, Perspective, before_eye
+from lidar_perception.rendering.files import MAX_ANIMATED, check_film, open_film
+from lidar_perception.rendering.views import NEAR, BirdsEye, Perspective, project_lines
 from lidar_perception.types import InputError
 
 SIZE = 24, 16
@@ -26,14 +26,14 @@ def seeds():
 
 
 @given(seeds())
-def test_near_points_hide_far_ones_in_any_order(rng):
+def test_near_points_hide_far_ones(rng):
     count = rng.integers(0, 60)
     at = rng.uniform(-6, 30, (count, 2))
     depth = rng.permutation(count) * 0.5 + 1.0
     colors = rng.integers(1, 256, (count, 3)).astype(np.uint8)
     radius = np.where(depth < 10, 1.5, 0.5)
     canvas = Canvas(*SIZE)
-    canvas.points(at, depth, colors, radius)
+    canvas.draw_points(at, depth, colors, radius)
     expected = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     for k in np.argsort(-depth):
         column, row = np.floor(at[k]).astype(int)
@@ -45,12 +45,12 @@ def test_near_points_hide_far_ones_in_any_order(rng):
 
 
 @given(seeds())
-def test_lines_cover_the_pixels_within_their_width(rng):
+def test_line_covers_pixels_within_its_width(rng):
     start, end = rng.uniform(-20, 40, (2, 2))
     if np.hypot(*(end - start)) < 1:
         return
     canvas = Canvas(*SIZE)
-    canvas.lines([[start, end]], RED, 3.0)
+    canvas.draw_lines([[start, end]], RED, 3.0)
     x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
     way = end - start
     share = ((x - start[0]) * way[0] + (y - start[1]) * way[1]) / (way @ way)
@@ -61,48 +61,48 @@ def test_lines_cover_the_pixels_within_their_width(rng):
     assert (red[(away > 3.0) | (share < -margin - 0.1) | (share > 1 + margin + 0.1)] == 0).all()
 
 
-def test_dashed_lines_have_gaps_and_alpha_makes_them_fainter():
+def test_dashed_line_has_gaps_and_alpha_makes_it_fainter():
     plain, dashed, faint = (Canvas(60, 9) for _ in range(3))
     line = [[[2, 4.5], [58, 4.5]]]
-    plain.lines(line, RED, 2.0)
-    dashed.lines(line, RED, 2.0, dashed=True)
-    faint.lines(line, RED, 2.0, alpha=0.5)
+    plain.draw_lines(line, RED, 2.0)
+    dashed.draw_lines(line, RED, 2.0, dashed=True)
+    faint.draw_lines(line, RED, 2.0, alpha=0.5)
     row = [canvas.pixels[4, 4:56, 0] for canvas in (plain, dashed, faint)]
     assert (row[0] == 255).all() and 0.3 < (row[1] == 255).mean() < 0.8
     assert np.abs(row[2] - 127.5).max() <= 1
 
 
-def test_what_cannot_be_drawn_is_left_out():
+def test_canvas_skips_invalid_and_outside_shapes():
     canvas = Canvas(*SIZE)
-    canvas.lines(np.full((2, 2, 2), np.nan), RED)
-    canvas.lines(np.zeros((0, 2, 2)), RED)
-    canvas.lines([[[-9e9, -5], [9e9, -5]], [[1e30, 1e30], [2e30, 1e30]]], RED)
-    canvas.points(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3), np.uint8), np.zeros(0))
-    canvas.polygon(np.full((4, 2), np.nan), RED)
-    canvas.polygon(np.array([[50, 50], [60, 50], [60, 60]]), RED)
-    canvas.texts([])
+    canvas.draw_lines(np.full((2, 2, 2), np.nan), RED)
+    canvas.draw_lines(np.zeros((0, 2, 2)), RED)
+    canvas.draw_lines([[[-9e9, -5], [9e9, -5]], [[1e30, 1e30], [2e30, 1e30]]], RED)
+    canvas.draw_points(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3), np.uint8), np.zeros(0))
+    canvas.fill_polygon(np.full((4, 2), np.nan), RED)
+    canvas.fill_polygon(np.array([[50, 50], [60, 50], [60, 60]]), RED)
+    canvas.draw_texts([])
     assert not canvas.pixels.any()
 
 
-def test_polygons_cover_what_is_inside():
+def test_polygon_covers_its_inside():
     for corners in np.array([[2, 3], [12, 3], [12, 9], [2, 9]]), np.array([[2, 9], [12, 9], [12, 3],
                                                                          [2, 3]]):
         canvas = Canvas(*SIZE)
-        canvas.polygon(corners, GREEN, 0.5)
+        canvas.fill_polygon(corners, GREEN, 0.5)
         assert (canvas.pixels[3:9, 2:12, 1] == 128).all()
         assert np.count_nonzero(canvas.pixels) == 60
 
 
-def test_texts_are_written_at_their_anchor():
+def test_text_is_placed_at_its_anchor():
     canvas = Canvas(80, 40)
-    canvas.texts([Text((70, 20), "12 m/s", (255, 255, 255), 14, "rm")])
+    canvas.draw_texts([Text((70, 20), "12 m/s", (255, 255, 255), 14, "rm")])
     rows, columns = np.nonzero(canvas.pixels[..., 0] > 200)
     assert 60 < columns.max() <= 70 and columns.min() > 10 and 10 < rows.min() < rows.max() < 30
 
 
 @pytest.mark.parametrize("name", VIEWS)
 @given(seeds())
-def test_views_keep_lines_straight_and_depths_in_order(name, rng):
+def test_view_keeps_lines_straight(name, rng):
     view = VIEWS[name]
     ends = rng.uniform(-20, 20, (2, 3))
     line = ends[0] + np.linspace(0, 1, 9)[:, None] * (ends[1] - ends[0])
@@ -113,7 +113,7 @@ def test_views_keep_lines_straight_and_depths_in_order(name, rng):
         assert np.abs(aside).max() <= 1e-6 * max(way @ way, 1)
     one = view.project(line.astype(np.float32))
     np.testing.assert_allclose(one[1], depth, atol=1e-3)
-    cut = before_eye(view, ends[None])
+    cut = project_lines(view, ends[None])
     assert np.isnan(cut).all() == bool((depth[[0, -1]] < NEAR).all())
 
 
@@ -132,12 +132,12 @@ def pictures(count):
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.gif", "a.webp"])
-def test_films_hold_every_picture_for_its_time(name, tmp_path):
+def test_film_has_every_picture_with_its_duration(name, tmp_path):
     path = tmp_path / "deep" / name
     if path.suffix in (".mp4", ".mkv"):
         pytest.importorskip("av", reason="needs PyAV, the extra [video]")
     check_film(path, 4)
-    with film(path, (160, 90)) as made:
+    with open_film(path, (160, 90)) as made:
         for k, picture in enumerate(pictures(4)):
             made.add(picture, 0.1 if k else 0.3)
         assert not path.exists()
@@ -148,7 +148,7 @@ def test_films_hold_every_picture_for_its_time(name, tmp_path):
 
 
 def read_film(path):
-    """Pictures, and when each begins, seconds."""
+    """Return the pictures and the start of each in seconds."""
     if path.suffix in (".gif", ".webp"):
         image, seen, times, now = Image.open(path), [], [], 0.0
         for k in range(image.n_frames):
@@ -164,16 +164,16 @@ def read_film(path):
     return [list(column) for column in zip(*frames)]
 
 
-def test_a_film_that_fails_or_has_no_picture_leaves_nothing(tmp_path):
+def test_failed_or_empty_film_leaves_no_file(tmp_path):
     for suffix in (".gif", *[".mp4"] * (importlib.util.find_spec("av") is not None)):
-        with film(tmp_path / f"a{suffix}", (160, 90)):
+        with open_film(tmp_path / f"a{suffix}", (160, 90)):
             pass
-    with pytest.raises(ZeroDivisionError), film(tmp_path / "a.gif", (160, 90)) as made:
+    with pytest.raises(ZeroDivisionError), open_film(tmp_path / "a.gif", (160, 90)) as made:
         made.add(pictures(1)[0], 1 / 0)
     assert not [*tmp_path.iterdir()]
 
 
-def test_films_that_cannot_be_made_are_refused(tmp_path, monkeypatch):
+def test_unsupported_films_are_refused(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"a.avi is not a film: .*\.mp4"):
         check_film(tmp_path / "a.avi", 1)
     with pytest.raises(InputError, match=f"would have {MAX_ANIMATED + 1} pictures.*--limit"):

@@ -68,7 +68,7 @@ def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> Non
     """Draw the frame with most pedestrians among those with candidates."""
     from lidar_perception.candidates.pipeline import find_candidates
     from lidar_perception.candidates.seeds import load_seed
-    from lidar_perception.rendering.colors import by_cluster
+    from lidar_perception.rendering.colors import color_by_cluster
     from lidar_perception.rendering.files import write_png
     from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
     from lidar_perception.scoring.centres.report import pedestrians_of, seed_source
@@ -85,5 +85,5 @@ def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> Non
     stage = Stage.of(scan, params.ground.sensor_pose.height, params.view.enabled)
     write_png(png, draw_frame(
         stage, LidarFrame(segmented.xyz), Boxes(found.final.boxes, found.final.class_ids), truth,
-        f"frame {frame.name}", colors=by_cluster(segmented.ground, segmented.cluster_ids)))
+        f"frame {frame.name}", colors=color_by_cluster(segmented.ground, segmented.cluster_ids)))
     console.print(f"picture: {png}")
