@@ -34,7 +34,7 @@ from lidar_perception.runs.machine import read_cpu_name
 from lidar_perception.runs.memory import keep_freed_memory
 from lidar_perception.runs.terminal import errors
 from lidar_perception.scoring.centres.report import pedestrians
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
 FULL_SCAN = 60_000   # points; a scan cut to the camera's view has some 20,000
@@ -117,12 +117,12 @@ def _with_camera(recording: Recording, pedestrian: list[Frame], count: int) -> l
     return [(f.load(), f.camera()) for f in evenly_chosen(chosen, count)]
 
 
-def _full_scans(recording: Recording, count: int) -> list[LidarFrame]:
+def _full_scans(recording: Recording, count: int) -> list[PointCloud]:
     whole = [f for f in recording if len(f.load()) > FULL_SCAN]
     return [f.load() for f in evenly_chosen(whole, count)]
 
 
-def _measure(in_view: list[np.ndarray], scans: list[LidarFrame], repeat: int) -> dict:
+def _measure(in_view: list[np.ndarray], scans: list[PointCloud], repeat: int) -> dict:
     """Each algorithm beside its peers, printed one after the other."""
     whole = [f.xyz for f in scans]
     near, far, rest = ([xyz.compress(~segment(xyz), axis=0) for xyz in clouds]

@@ -20,13 +20,13 @@ from lidar_perception.detectors.open import open_detector
 from lidar_perception.runs.memory import keep_freed_memory
 from lidar_perception.runs.terminal import show_progress
 from lidar_perception.runs.threads import PASSIVE_WAITING
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 BUSY = 2  # other processes
 WAYS = {"ours": PASSIVE_WAITING, "torch's": {}}
 
 
-def measure_busy(scans: list[LidarFrame], repeat: int) -> dict:
+def measure_busy(scans: list[PointCloud], repeat: int) -> dict:
     """ms a frame, without and beside BUSY busy processes, taken in turn."""
     title = f"PointPillars v4 compact beside {BUSY} busy processes"
     ms: dict[tuple[str, int], list[float]] = {(way, n): [] for way in WAYS for n in (0, BUSY)}
@@ -48,7 +48,7 @@ def measure_busy(scans: list[LidarFrame], repeat: int) -> dict:
 
 
 @contextmanager
-def _worker(environment: dict[str, str], scans: list[LidarFrame]) -> Iterator[ProcessPoolExecutor]:
+def _worker(environment: dict[str, str], scans: list[PointCloud]) -> Iterator[ProcessPoolExecutor]:
     """A process that has loaded torch in this environment."""
     before = {name: os.environ.pop(name, None) for name in PASSIVE_WAITING}
     os.environ.update(environment)
@@ -67,7 +67,7 @@ def _worker(environment: dict[str, str], scans: list[LidarFrame]) -> Iterator[Pr
 _ready: dict = {}  # in a worker
 
 
-def _prepare(scans: list[LidarFrame]) -> None:
+def _prepare(scans: list[PointCloud]) -> None:
     import torch
     keep_freed_memory()
     torch.set_num_threads(len(os.sched_getaffinity(0)))  # as the nodes do

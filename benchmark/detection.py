@@ -16,7 +16,7 @@ from rich.table import Table
 from benchmark.rows import against, measured
 from benchmark.timing import Clock, evenly_chosen
 from lidar_perception.detectors.checkpoint import Header
-from lidar_perception.detectors.contract import FUSED, Found
+from lidar_perception.detectors.contract import FUSED, DetectionResult
 from lidar_perception.detectors.devices import chosen_device
 from lidar_perception.detectors.open import POINTPILLARS, open_detector
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS, network_config
@@ -27,7 +27,7 @@ from lidar_perception.detectors.pointpillars.proposer import PointPillarsPropose
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.runs.machine import read_cpu_name
 from lidar_perception.runs.terminal import console, show_progress
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 PAPER_TO_V0 = {"v0": 1.0, "v1": 1.06, "v2": 1.86, "v3": 2.48, "v4": 3.54}  # paper B, RTX 4090
 TARGET = 1.6      # of v4 to v0, less than
@@ -35,7 +35,7 @@ CANDIDATES = 200  # anchors that pass, as in a street
 FEW = 3           # scans for full on a CPU, where a frame takes half a second
 
 
-def measure_detection(scans: list[LidarFrame], repeat: int,
+def measure_detection(scans: list[PointCloud], repeat: int,
                       sizes: Sequence[str] = tuple(SIZES)) -> dict:
     """Medians over whole scans, each `repeat` times, versions taken in turn, all in torch. Weights
     are random: time depends on them only by what passes the thresholds, which are set to let
@@ -53,7 +53,7 @@ def measure_detection(scans: list[LidarFrame], repeat: int,
     return content
 
 
-def _medians(detectors: dict[str, PointPillarsDetector], scans: list[LidarFrame], repeat: int,
+def _medians(detectors: dict[str, PointPillarsDetector], scans: list[PointCloud], repeat: int,
              title: str) -> dict[str, dict]:
     ms = {version: np.zeros((len(scans), repeat, len(STEPS))) for version in detectors}
     for i, scan in enumerate(show_progress(scans, title, len(scans))):
@@ -90,7 +90,7 @@ class Heard:
 
 
 def _random_detector(version: str, size: str, device: torch.device,
-                     scan: LidarFrame) -> PointPillarsDetector:
+                     scan: PointCloud) -> PointPillarsDetector:
     """Warmed up, with thresholds that CANDIDATES anchors pass in this scan."""
     config = network_config(version, size)
     torch.manual_seed(0)
@@ -125,7 +125,7 @@ def print_detection(content: dict) -> None:
                       + ("met" if ratio < TARGET else "not met"))
 
 
-def measure_engines(scans: list[LidarFrame], repeat: int,
+def measure_engines(scans: list[PointCloud], repeat: int,
                     detectors: Sequence[str] = (POINTPILLARS, FUSED)) -> dict:
     """Compare the engines torch and sparse of PointPillars with the weights of the package: median
     CPU time of one thread, in turns. `same` counts scans with the same detections."""
@@ -150,7 +150,7 @@ def measure_engines(scans: list[LidarFrame], repeat: int,
     return measured(title, len(scans), np.median([len(scan) for scan in scans]), rows)
 
 
-def _same(a: Found, b: Found) -> bool:
+def _same(a: DetectionResult, b: DetectionResult) -> bool:
     a_, b_ = a.detections, b.detections
     return bool(np.array_equal(a_.class_ids, b_.class_ids)
                 and np.allclose(a_.boxes, b_.boxes, rtol=0, atol=1e-4)

@@ -23,7 +23,7 @@ from lidar_perception.ground.threshold import (
 )
 from lidar_perception.runs.terminal import show_progress
 from lidar_perception.scoring.points.segmentation import PROTOCOLS, GroundReport, ground_by_protocol
-from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, PointCloud
 
 PARAMS = GroundParams()
 FRAMES_OF_2000 = 3  # scikit-learn's 2000 trials take seconds
@@ -108,7 +108,7 @@ def _settled(points: np.ndarray, plane: np.ndarray,
     return plane
 
 
-def measure_patchwork(frames: list[LidarFrame], repeat: int) -> dict:
+def measure_patchwork(frames: list[PointCloud], repeat: int) -> dict:
     """Ours beside the bare library on an array that already exists; a new object for each."""
     title, name = "Patchwork++, whole scan", peers.PATCHWORK.name
     points = np.median([len(f) for f in frames])
@@ -131,7 +131,7 @@ def measure_patchwork(frames: list[LidarFrame], repeat: int) -> dict:
             unit="", target=1.1, same=same)])
 
 
-def _with_intensity(frame: LidarFrame) -> np.ndarray:
+def _with_intensity(frame: PointCloud) -> np.ndarray:
     return frame.points()
 
 
@@ -191,11 +191,11 @@ def measure_labelled(frames: list[Frame], repeat: int) -> dict:
                         else {"note": missing[name]} for name in methods}}
 
 
-def _of_ours(name: str, frame: LidarFrame) -> np.ndarray:
+def _of_ours(name: str, frame: PointCloud) -> np.ndarray:
     return METHODS[name](frame.xyz, frame.intensity, PARAMS)
 
 
-def _of_wheel(frame: LidarFrame) -> np.ndarray:
+def _of_wheel(frame: PointCloud) -> np.ndarray:
     inside = np.flatnonzero((np.abs(frame.xyz[:, :2]) <= PARAMS.cloth.max_range).all(axis=1))
     ground = peers.CLOTH.run(frame.xyz[inside].astype(np.float64))
     return _mask(inside[np.asarray(ground, np.int64)], len(frame))

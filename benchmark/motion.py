@@ -25,7 +25,7 @@ from lidar_perception.simulation.raycast import cast
 from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.scene import make_scene
 from lidar_perception.simulation.sensor import HDL64E, Motion, rays
-from lidar_perception.types import CLASSES, LidarFrame
+from lidar_perception.types import CLASSES, PointCloud
 
 YAW_RATES = 0.0, 0.3, 0.6  # rad/s; at 10 m/s the last is a turn of 17 m
 POLE = 80                  # SemanticKITTI
@@ -81,7 +81,7 @@ def errors(xyz: np.ndarray, met: np.ndarray, thing: np.ndarray) -> dict[int, flo
 def detected(detector: Detector, xyz: np.ndarray, intensity: np.ndarray, labels) -> list[float]:
     """Metres, from above, between each label that is found and the nearest detection of its
     class."""
-    found, far = detector(LidarFrame(xyz, intensity)).detections, []
+    found, far = detector(PointCloud(xyz, intensity)).detections, []
     for box, kind in zip(labels.boxes, labels.class_ids):
         same = found.boxes[found.class_ids == kind]
         apart = np.hypot(*(same[:, :2] - box[:2]).T).min(initial=np.inf)

@@ -27,11 +27,11 @@ from lidar_perception.robot.poses import invert_pose
 from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.simulation.drive import scans
 from lidar_perception.tracking.ego import Odometry
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 DETECTORS = ("fused", "pointnet")
 FIRST_STREET, FURTHER = 7301, 10  # frames over which drift is said
-Scans = Iterator[tuple[str, LidarFrame, np.ndarray | None]]
+Scans = Iterator[tuple[str, PointCloud, np.ndarray | None]]
 
 
 def as_it_comes() -> Callable[[np.ndarray], np.ndarray]:

@@ -22,13 +22,13 @@ from lidar_perception.detectors.pointnet.params import STEPS
 from lidar_perception.detectors.pointnet.predict import predict
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.runs.terminal import console
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 COUNT = 100                  # clusters
 NETWORK, WHOLE = 40.0, 120.0  # ms, targets
 
 
-def measure_pointnet(scans: Sequence[LidarFrame], repeat: int) -> dict:
+def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
     """Medians over whole scans. The networks have random weights, of which time does not depend,
     and read COUNT clusters of a scan, or as many as it has."""
     torch.manual_seed(0)

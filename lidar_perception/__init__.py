@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from lidar_perception.data.open import open_recording
     from lidar_perception.tracking.state import Tracks
     from lidar_perception.tracking.tracker import Tracker
-    from lidar_perception.types import Detections
-    from lidar_perception.types import LidarFrame as PointCloud
+    from lidar_perception.types import Detections, PointCloud
 
 __version__ = "0.1.0"
 __all__ = ["Detections", "PointCloud", "Tracker", "Tracks", "cluster", "evaluate",
@@ -33,7 +32,7 @@ __all__ = ["Detections", "PointCloud", "Tracker", "Tracks", "cluster", "evaluate
 
 _OTHER_MODULES = {  # (module, name) of everything outside lidar_perception.api
     "Detections": ("types", "Detections"),
-    "PointCloud": ("types", "LidarFrame"),
+    "PointCloud": ("types", "PointCloud"),
     "Tracker": ("tracking.tracker", "Tracker"),
     "Tracks": ("tracking.state", "Tracks"),
     "open_recording": ("data.open", "open_recording"),

@@ -36,8 +36,8 @@ from lidar_perception.types import (
     SENSOR_HEIGHT,
     Detections,
     InputError,
-    LidarFrame,
-    as_frame,
+    PointCloud,
+    as_point_cloud,
     unknown_name,
 )
 
@@ -67,7 +67,7 @@ def load_detector(name_or_file: str | Path = FUSED, *, device: str = "auto", ran
                          range=range, settings=settings or {})
 
 
-def segment_ground(xyz: LidarFrame | ArrayLike, method: str = "threshold", *,
+def segment_ground(xyz: PointCloud | ArrayLike, method: str = "threshold", *,
                    sensor_height: float = SENSOR_HEIGHT, intensity: ArrayLike | None = None,
                    **params: Any) -> np.ndarray:
     """Segment the ground of a cloud.
@@ -98,7 +98,7 @@ def segment_ground(xyz: LidarFrame | ArrayLike, method: str = "threshold", *,
         defaults, method=method, sensor_pose=pose, **{method: own}))
 
 
-def cluster(xyz: LidarFrame | ArrayLike, method: str = "dbscan", *,
+def cluster(xyz: PointCloud | ArrayLike, method: str = "dbscan", *,
             ground: ArrayLike | None = None, density: float = 0.0, **params: Any) -> np.ndarray:
     """Cluster the points of a cloud.
 
@@ -123,12 +123,12 @@ def cluster(xyz: LidarFrame | ArrayLike, method: str = "dbscan", *,
     defaults = ClusteringParams()
     own = _set_params(getattr(defaults, method), params)
     chosen = _set_params(replace(defaults, method=method, **{method: own}), {"density": density})
-    cloud = as_frame(xyz)
+    cloud = as_point_cloud(xyz)
     mask = np.zeros(len(cloud), bool) if ground is None else np.asarray(ground)
     return cluster_obstacles(cloud, mask, chosen)
 
 
-def find_candidates(xyz: LidarFrame | ArrayLike, *, click: ArrayLike | None = None,
+def find_candidates(xyz: PointCloud | ArrayLike, *, click: ArrayLike | None = None,
                     sensor_height: float = SENSOR_HEIGHT, ground: np.ndarray | None = None,
                     cluster_ids: np.ndarray | None = None,
                     settings: Mapping[str, Any] | None = None) -> Detections:
@@ -159,7 +159,7 @@ def find_candidates(xyz: LidarFrame | ArrayLike, *, click: ArrayLike | None = No
     return candidates.final
 
 
-def evaluate(detector: str | Path | Detector | Callable[[LidarFrame], Detections],
+def evaluate(detector: str | Path | Detector | Callable[[PointCloud], Detections],
              recording: str | Path | Recording, *, limit: int | None = None,
              min_score: float | None = MIN_SCORE, intervals: int = 0) -> dict[str, Any]:
     """Score a detector on the labelled frames of a recording, as `evaluate detection` does.
@@ -233,10 +233,10 @@ def simulate(frames: int = 40, seed: int = 1, sensor: str = "hdl64e", scene: str
                                scenes=Scenes(kind, people, scene))
 
 
-def _make_cloud(xyz: LidarFrame | ArrayLike, intensity: ArrayLike | None) -> LidarFrame:
-    if intensity is not None and isinstance(xyz, LidarFrame):
+def _make_cloud(xyz: PointCloud | ArrayLike, intensity: ArrayLike | None) -> PointCloud:
+    if intensity is not None and isinstance(xyz, PointCloud):
         raise InputError("a PointCloud has its own intensity; give either a PointCloud or arrays")
-    return as_frame(xyz, intensity)
+    return as_point_cloud(xyz, intensity)
 
 
 def _set_params(params: P, values: Mapping[str, Any]) -> P:

@@ -75,7 +75,8 @@ MAX_DIAGONAL = 6.40  # metres, of the largest class (paper B, Table 2)
 CLASSES = tuple(row.name for row in TABLE)
 _NAME_BY_SPELLING = {"".join(filter(str.isalnum, name)).casefold(): name for name in CLASSES}
 # Index into CLASSES by every name of a class, in lower case.
-CALLED = {name.casefold(): i for i, row in enumerate(TABLE) for name in (row.name, *row.called)}
+ID_BY_ALIAS = {name.casefold(): i for i, row in enumerate(TABLE)
+               for name in (row.name, *row.called)}
 DETECTED = {row.name: row.numbers for row in TABLE if row.numbers is not None}
 BY_SIZE = sorted(DETECTED, key=lambda name: -DETECTED[name].min_diagonal)  # largest first
 CAR, PEDESTRIAN, CYCLIST, DONT_CARE = map(CLASSES.index, ("Car", "Pedestrian", "Cyclist",

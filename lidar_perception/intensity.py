@@ -98,7 +98,7 @@ def find_scale_problem(intensity: np.ndarray | None, factor: float = 1.0) -> str
         return None
     guess = f", so it is divided by {inferred:g}, a guess" if inferred != 1.0 else ""
     return (f"intensity goes up to {greatest:.3g} where 1 is a full reflection{guess}; set "
-            "input.intensity_max, or in Python intensity_max of LidarFrame.of, to the value of a "
+            "input.intensity_max, or in Python intensity_max of PointCloud.of, to the value of a "
             "full reflection (1, 100 or 255 for most drivers; setup measures it)")
 
 

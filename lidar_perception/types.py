@@ -18,7 +18,7 @@ from lidar_perception.classes import CLASSES, PEDESTRIAN, class_name
 from lidar_perception.intensity import to_unit
 
 __all__ = ["CLASSES", "PEDESTRIAN", "Detections", "GroundTruth", "InputError", "InputWarning",
-           "LidarFrame", "usable_returns"]
+           "PointCloud", "usable_returns"]
 
 MAX_RANGE = 1e5  # metres; what is farther is a broken return, not a point
 LIKELY = 0.6  # 0..1, see difflib: two names that are this similar may be the same one, misspelt
@@ -77,7 +77,7 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 @dataclass(frozen=True)
-class LidarFrame:
+class PointCloud:
     """One cloud, with only the returns that can be used.
 
     xyz (N, 3) float32 metres in frame_id, C-contiguous; intensity (N,) float32 0..1 or None;
@@ -92,7 +92,7 @@ class LidarFrame:
     def __post_init__(self) -> None:
         shape = np.shape(self.xyz)
         if len(shape) != 2 or shape[1] != 3:
-            raise InputError(f"xyz of a LidarFrame has shape {shape}, not (N, 3); LidarFrame.of "
+            raise InputError(f"xyz of a PointCloud has shape {shape}, not (N, 3); PointCloud.of "
                              "takes points (N, 3) or (N, 4)")
         if self.intensity is not None and np.shape(self.intensity) != shape[:1]:
             raise InputError(f"intensity has shape {np.shape(self.intensity)} for {shape[0]} "
@@ -100,7 +100,7 @@ class LidarFrame:
 
     @staticmethod
     def of(points: ArrayLike, intensity: ArrayLike | None = None, stamp_ns: int = 0,
-           frame_id: str = "", intensity_max: float | None = None) -> LidarFrame:
+           frame_id: str = "", intensity_max: float | None = None) -> PointCloud:
         """Return the frame of the usable returns (see usable_returns) among the points of a sensor.
 
         Args:
@@ -115,17 +115,17 @@ class LidarFrame:
         Raises:
             InputError: wrong shape or type. The message names the shape and the allowed ones.
         """
-        frame = as_frame(points, intensity, stamp_ns, frame_id, intensity_max)
+        frame = as_point_cloud(points, intensity, stamp_ns, frame_id, intensity_max)
         usable = usable_returns(frame.xyz)
         return frame if usable.all() else frame.take(np.flatnonzero(usable))
 
     def __len__(self) -> int:
         return len(self.xyz)
 
-    def take(self, indices: np.ndarray) -> LidarFrame:
+    def take(self, indices: np.ndarray) -> PointCloud:
         """The frame of the points at indices (M,)."""
         intensity = None if self.intensity is None else self.intensity.take(indices)
-        return LidarFrame(self.xyz.take(indices, axis=0), intensity, self.stamp_ns, self.frame_id)
+        return PointCloud(self.xyz.take(indices, axis=0), intensity, self.stamp_ns, self.frame_id)
 
     def points(self) -> np.ndarray:
         """(N, 4) float32 [x y z intensity]; 0 without intensity."""
@@ -133,14 +133,16 @@ class LidarFrame:
         return np.column_stack([self.xyz, intensity])
 
 
-def as_frame(cloud: LidarFrame | ArrayLike, intensity: ArrayLike | None = None, stamp_ns: int = 0,
-             frame_id: str = "", intensity_max: float | None = None) -> LidarFrame:
-    """Return the frame of a cloud with all its points, also those that are not usable; a LidarFrame
-    is returned as it is. Arguments and errors as of LidarFrame.of."""
-    if isinstance(cloud, LidarFrame):
+def as_point_cloud(cloud: PointCloud | ArrayLike, intensity: ArrayLike | None = None,
+                   stamp_ns: int = 0, frame_id: str = "",
+                   intensity_max: float | None = None) -> PointCloud:
+    """Return the frame of a cloud with all its points, also those that are not usable; a PointCloud
+    is returned as it is. Arguments and errors as of PointCloud.of."""
+    if isinstance(cloud, PointCloud):
         return cloud
-    points = _numbers(cloud, "a cloud", "a LidarFrame (frame.load() of a recorded frame, to_frame "
-                      "of a PointCloud2) or numbers (N, 3) [x y z] or (N, 4) [x y z intensity]")
+    points = _numbers(cloud, "a cloud", "a PointCloud (frame.load() of a recorded frame, "
+                      "to_point_cloud of a PointCloud2) or numbers (N, 3) [x y z] or (N, 4) "
+                      "[x y z intensity]")
     if points.shape == (0,):
         points = points.reshape(0, 3)
     if points.ndim != 2 or points.shape[1] not in (3, 4):
@@ -163,7 +165,7 @@ def as_frame(cloud: LidarFrame | ArrayLike, intensity: ArrayLike | None = None, 
         values = to_unit(values, full)
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes inf, which is not usable
         xyz = np.ascontiguousarray(points[:, :3], np.float32)
-    return LidarFrame(xyz, values, stamp_ns, frame_id)
+    return PointCloud(xyz, values, stamp_ns, frame_id)
 
 
 def _numbers(given: Any, what: str, allowed: str) -> np.ndarray:

@@ -20,7 +20,7 @@ from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.param_fields import with_values
 from lidar_perception.tracking.ego import usable
-from lidar_perception.types import InputError, LidarFrame, did_you_mean
+from lidar_perception.types import InputError, PointCloud, did_you_mean
 from lidar_studio.interpolation import Motion
 from lidar_studio.journal import header
 
@@ -69,7 +69,7 @@ def scanned(frame: Frame) -> Scan:
     return scan_of(cloud, found.ground, found.cluster_ids)
 
 
-def scan_of(cloud: LidarFrame, ground: Array, cluster_ids: Array) -> Scan:
+def scan_of(cloud: PointCloud, ground: Array, cluster_ids: Array) -> Scan:
     """The scan of a cloud of N points with ground (N,) bool and cluster_ids (N,) int."""
     order = np.random.default_rng(0).permutation(len(cloud))
     intensity = np.zeros(len(cloud)) if cloud.intensity is None else cloud.intensity

@@ -31,7 +31,7 @@ from lidar_perception.wire.messages import (
     read_cluster_ids,
     read_column,
     to_detections,
-    to_frame,
+    to_point_cloud,
 )
 from lidar_perception.wire.topics import FOUND, TRACKS, TRUTH
 from lidar_studio.drive import Drive, Scan, scan_of, scanned
@@ -231,8 +231,8 @@ def recorded_scan(frame: Frame) -> Scan:
 
 def scan_in(message: Any, intensity_max: float = 0.0, scale: FullScale = infer_full_scale) -> Scan:
     """Return a PointCloud2 with the ground and clusters that it has; none where it has no such
-    column. intensity_max, scale: see to_frame. InputError where it is broken."""
-    cloud, indices = to_frame(message, intensity_max, scale)
+    column. intensity_max, scale: see to_point_cloud. InputError where it is broken."""
+    cloud, indices = to_point_cloud(message, intensity_max, scale)
     ground, clusters = read_column(message, "ground", indices), read_cluster_ids(message, indices)
     return scan_of(cloud, np.zeros(len(cloud), bool) if ground is None else ground > 0,
                    np.zeros(len(cloud), np.int32) if clusters is None else clusters[0])

@@ -79,7 +79,7 @@ def carrier_too(monkeypatch):
     """Networks of random weights see things anywhere, also round the sensor: with this they say so.
     What is left out there otherwise: test_contract.py."""
     from lidar_perception.detectors import normalized_view
-    monkeypatch.setattr(normalized_view, "without_carrier", lambda detections, height: detections)
+    monkeypatch.setattr(normalized_view, "drop_ego_vehicle", lambda detections, height: detections)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from samples import object_folder, scene
 
 import lidar_perception as lp
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.ground.params import GroundParams, PatchworkParams, SensorPoseParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.types import InputError
@@ -136,5 +136,5 @@ def test_tracker_follows_detections():
 def test_loaded_detector_returns_detections():
     detector = lp.load_detector(f"{__name__}:NearestBox", min_score=0.4)
     found = detector(scene(0))
-    assert isinstance(found, Found) and len(found.detections) == 1
+    assert isinstance(found, DetectionResult) and len(found.detections) == 1
     assert len(lp.load_detector(f"{__name__}:NearestBox", min_score=0.6)(scene(0)).detections) == 0

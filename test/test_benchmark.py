@@ -23,7 +23,7 @@ from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import EuclideanParams
 from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.detectors.pointpillars import detector as pointpillars
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 pytestmark = pytest.mark.no_cover  # benchmark/ is not in the package
 SKLEARN = [p.name for p in peers.SKLEARN]
@@ -95,7 +95,7 @@ def test_a_missed_target_is_shown(unit, target, good, bad, text):
 
 
 def test_peers_that_are_not_installed_are_said_to_be(nothing_installed, capsys):
-    xyz, frame = cloud(), LidarFrame(scene()[:, :3], scene()[:, 3])
+    xyz, frame = cloud(), PointCloud(scene()[:, :3], scene()[:, 3])
     for content in (measure_dbscan("DBSCAN", [xyz], 1, 12.0), ground.measure_patchwork([frame], 1),
                     ground.measure_cloth([xyz], 1)):
         print_measured(json.loads(json.dumps(content)))
@@ -107,7 +107,7 @@ def test_peers_that_are_not_installed_are_said_to_be(nothing_installed, capsys):
 def test_ground_scores_do_without_the_libraries(nothing_installed, capsys):
     points = scene()
     semantic = np.where(points[:, 2] < -1.6, 40, 30).astype(np.uint16)
-    scan = Frame.of("a", LidarFrame(points[:, :3], points[:, 3]),
+    scan = Frame.of("a", PointCloud(points[:, :3], points[:, 3]),
                     point_truth=lambda: PointTruth(semantic, np.zeros_like(semantic)))
     content = ground.measure_labelled([scan], 1)
     print_ground(json.loads(json.dumps(content)))
@@ -123,7 +123,7 @@ def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsy
         ran[config.version] = tuple(column is not None for column in made)
         return made
     monkeypatch.setattr(pointpillars, "experts", seen)
-    content = measure_detection([LidarFrame(points[:, :3], points[:, 3])], 1, ("compact",))
+    content = measure_detection([PointCloud(points[:, :3], points[:, 3])], 1, ("compact",))
     print_detection(json.loads(json.dumps(content)))
     shown = capsys.readouterr().out
     versions = content["sizes"]["compact"]["versions"]
@@ -140,7 +140,7 @@ def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsy
 
 def test_engines_are_timed_and_compared(one_thread, capsys):
     points = scene()
-    content = measure_engines([LidarFrame(points[:, :3], points[:, 3])], 1, ("pointpillars",))
+    content = measure_engines([PointCloud(points[:, :3], points[:, 3])], 1, ("pointpillars",))
     print_measured(json.loads(json.dumps(content)))
     assert "around, engine torch" in " ".join(capsys.readouterr().out.split())
     assert [(row["same"], row["value"] > 0) for row in content["rows"]] == [(1, True)] * 2
@@ -152,7 +152,7 @@ def test_a_frame_is_timed_beside_busy_processes(monkeypatch, capsys):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)  # a command before it may have set it
     points = scene()
     monkeypatch.setattr(busy, "BUSY", 1)
-    content = busy.measure_busy([LidarFrame(points[:, :3], points[:, 3])], 1)
+    content = busy.measure_busy([PointCloud(points[:, :3], points[:, 3])], 1)
     print_measured(json.loads(json.dumps(content)))
     assert "1 busy processes" in capsys.readouterr().out
     assert all(r["value"] > 0 for r in content["rows"]) and len(content["rows"]) == 3
@@ -161,7 +161,7 @@ def test_a_frame_is_timed_beside_busy_processes(monkeypatch, capsys):
 
 def test_the_cluster_network_is_timed_beside_a_plain_one(one_thread, capsys):
     points = scene()
-    content = measure_pointnet([LidarFrame(points[:, :3], points[:, 3])] * 2, 1)
+    content = measure_pointnet([PointCloud(points[:, :3], points[:, 3])] * 2, 1)
     print_pointnet(json.loads(json.dumps(content)))
     shown = capsys.readouterr().out
     assert all(name in shown for name in ("improved PointNet", "plain PointNet++", "clustering"))

@@ -18,7 +18,7 @@ from lidar_perception.geometry import (
     wrap_angle,
     wrap_line,
 )
-from lidar_perception.types import MAX_RANGE, LidarFrame, usable_returns
+from lidar_perception.types import MAX_RANGE, PointCloud, usable_returns
 
 seeds = st.integers(0, 2**32 - 1)
 angles = st.floats(-50, 50)
@@ -163,7 +163,7 @@ def test_usable_returns_takes_strided_and_empty_arrays():
     wide = np.zeros((4, 6), np.float32)
     wide[2, 1] = 5
     assert usable_returns(wide[:, :3]).tolist() == [False, False, True, False]
-    assert len(LidarFrame(wide[:, :3])) == 4
+    assert len(PointCloud(wide[:, :3])) == 4
 
 
 # --- the camera ----------------------------------------------------------------------------

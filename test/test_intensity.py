@@ -1,4 +1,4 @@
-"""Scale of intensities, and arrays in place of a LidarFrame."""
+"""Scale of intensities, and arrays in place of a PointCloud."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.robot.params import CropParams
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.tracking.tracker import Tracker
-from lidar_perception.types import Detections, InputError, LidarFrame
+from lidar_perception.types import Detections, InputError, PointCloud
 from lidar_perception.wire.params import InputParams
 
 UNIT = np.random.default_rng(0).uniform(0, 1, 3000).astype(np.float32) ** 3
@@ -96,7 +96,7 @@ def test_a_wrong_scale_is_reported_with_the_remedy(full):
     assert guess_scale(values) == full
     problem = find_scale_problem(values)
     assert "input.intensity_max" in problem and f"divided by {full}, a guess" in problem
-    assert "LidarFrame.of" in problem and "\n" not in problem
+    assert "PointCloud.of" in problem and "\n" not in problem
     for factor in (0.0, 1 / full):  # fused.intensity_scale ignores or corrects the intensity
         assert find_scale_problem(values, factor) is None and guess_scale(values, factor) == 1.0
     assert guess_scale(values, 0.4) == full
@@ -123,7 +123,7 @@ CLOUD = np.random.default_rng(1).uniform([2, -9, -2, 0], [30, 9, 1, 1], (400, 4)
     (np.ones(9, [("x", "f4"), ("y", "f4")]), "ndarray of void"), ([[1, 2, 3], [1]], "as an array"),
     ("drive.bag", "is str"), (None, "is NoneType"), (7.0, r"shape \(\)")])
 def test_every_entry_point_refuses_invalid_clouds(points, remedy):
-    for function in (LidarFrame.of, segment_ground, cluster,
+    for function in (PointCloud.of, segment_ground, cluster,
                      lambda cloud: cluster_obstacles(cloud, np.zeros(9, bool))):
         with pytest.raises(InputError, match=f"a cloud .*{remedy}") as error:
             function(points)
@@ -131,29 +131,29 @@ def test_every_entry_point_refuses_invalid_clouds(points, remedy):
 
 
 def test_clouds_of_three_and_four_columns_give_equal_frames():
-    plain = LidarFrame.of(CLOUD[:, :3])
-    four = LidarFrame.of(CLOUD, stamp_ns=5, frame_id="velodyne")
+    plain = PointCloud.of(CLOUD[:, :3])
+    four = PointCloud.of(CLOUD, stamp_ns=5, frame_id="velodyne")
     assert plain.intensity is None and (four.stamp_ns, four.frame_id) == (5, "velodyne")
-    for same in (LidarFrame.of(CLOUD.tolist()), LidarFrame.of(CLOUD[:, :3], CLOUD[:, 3]),
-                 LidarFrame.of(CLOUD[:, :3], list(CLOUD[:, 3])),
-                 LidarFrame.of(CLOUD.copy("F"))):
+    for same in (PointCloud.of(CLOUD.tolist()), PointCloud.of(CLOUD[:, :3], CLOUD[:, 3]),
+                 PointCloud.of(CLOUD[:, :3], list(CLOUD[:, 3])),
+                 PointCloud.of(CLOUD.copy("F"))):
         assert np.array_equal(same.xyz, plain.xyz) and np.array_equal(same.intensity,
                                                                       four.intensity)
         assert same.xyz.flags.c_contiguous and same.intensity.dtype == np.float32
-    whole = LidarFrame.of(np.int64([[5, 0, -1], [0, 0, 0]]))
+    whole = PointCloud.of(np.int64([[5, 0, -1], [0, 0, 0]]))
     assert whole.xyz.tolist() == [[5, 0, -1]]
     for empty in ([], np.zeros((0, 3)), np.zeros((0, 4)), np.full((5, 4), np.nan)):
-        assert len(LidarFrame.of(empty)) == 0
+        assert len(PointCloud.of(empty)) == 0
 
 
 def test_intensity_scale_is_declared_or_inferred_from_the_type():
     raw = (CLOUD[:, 3] * 255).astype(np.uint8)
     expected = raw / np.float32(255)
     xyz = CLOUD[:, :3]
-    for frame in (LidarFrame.of(xyz, raw), LidarFrame.of(xyz, raw.astype(float), intensity_max=255),
-                  LidarFrame.of(np.column_stack([xyz, raw]), intensity_max=255)):
+    for frame in (PointCloud.of(xyz, raw), PointCloud.of(xyz, raw.astype(float), intensity_max=255),
+                  PointCloud.of(np.column_stack([xyz, raw]), intensity_max=255)):
         assert np.array_equal(frame.intensity, expected)
-    odd = LidarFrame.of(xyz[:3], [np.nan, -1, 0.5]).intensity
+    odd = PointCloud.of(xyz[:3], [np.nan, -1, 0.5]).intensity
     assert odd.tolist() == [0, 0, 0.5]
     for wrong, said in ((dict(intensity=raw[:9]), r"\(9,\) for 400 points"),
                         (dict(intensity=raw[:, None]), r"\(400, 1\) for 400"),
@@ -161,11 +161,11 @@ def test_intensity_scale_is_declared_or_inferred_from_the_type():
                         (dict(intensity_max=0.0), "intensity_max is 0"),
                         (dict(intensity_max=np.nan), "intensity_max is nan")):
         with pytest.raises(InputError, match=said):
-            LidarFrame.of(xyz, **wrong)
+            PointCloud.of(xyz, **wrong)
     with pytest.raises(InputError, match="given twice"):
-        LidarFrame.of(CLOUD, raw)
-    with pytest.raises(InputError, match=r"shape \(400, 4\), not \(N, 3\); LidarFrame.of"):
-        LidarFrame(CLOUD)
+        PointCloud.of(CLOUD, raw)
+    with pytest.raises(InputError, match=r"shape \(400, 4\), not \(N, 3\); PointCloud.of"):
+        PointCloud(CLOUD)
 
 
 @pytest.mark.parametrize("method", ["threshold", "patchwork", "cloth"])
@@ -173,24 +173,24 @@ def test_ground_of_an_array_equals_that_of_its_frame(method):
     params = GroundParams(method=method)
     xyz = np.random.default_rng(2).uniform([3, -9, -1.75], [30, 9, -1.7], (2000, 3))
     cloud = np.column_stack([xyz, UNIT[:2000]]).astype(np.float32)
-    expected = segment_ground(LidarFrame.of(cloud), params)
+    expected = segment_ground(PointCloud.of(cloud), params)
     assert expected.any() and np.array_equal(segment_ground(cloud, params), expected)
     cloud[7] = np.nan
     found = segment_ground(cloud, params)
     assert found.shape == (2000,) and not found[7]
     bright = segment_ground(np.column_stack([xyz, UNIT[:2000] * 255]), params)
-    assert np.array_equal(bright, segment_ground(LidarFrame.of(np.column_stack(
+    assert np.array_equal(bright, segment_ground(PointCloud.of(np.column_stack(
         [xyz, UNIT[:2000] * 255]), intensity_max=255), params))
 
 
 def test_clusters_of_an_array_equal_those_of_its_frame():
-    ids = cluster(LidarFrame.of(CLOUD))
+    ids = cluster(PointCloud.of(CLOUD))
     assert np.array_equal(cluster(CLOUD), ids) and np.array_equal(cluster(CLOUD[:, :3]), ids)
     with pytest.raises(InputError, match="ground has 3 values for 400 points"):
         cluster_obstacles(CLOUD, np.zeros(3, bool))
     with pytest.raises(InputError, match="cluster_ids has 3 values for 400 points"):
         segment_cloud(CLOUD, cluster_ids=np.zeros(3, int))
-    expected = segment_cloud(LidarFrame.of(CLOUD))
+    expected = segment_cloud(PointCloud.of(CLOUD))
     for same in (segment_cloud(CLOUD),
                  segment_cloud(CLOUD.tolist(), ground=expected.ground.tolist())):
         assert np.array_equal(same.cluster_ids, expected.cluster_ids)

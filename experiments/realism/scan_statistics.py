@@ -23,7 +23,7 @@ from lidar_perception.geometry import box_corners, horizontal_range, points_in_b
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.scoring.centres.matching import RANGE_NAMES
-from lidar_perception.types import GroundTruth, LidarFrame
+from lidar_perception.types import GroundTruth, PointCloud
 
 CLASSES = tuple(DETECTED)
 PERSON_HEIGHT = 1.7       # metres; the seed's height for the height filter of paper A's stage 1
@@ -97,13 +97,13 @@ CURVES = {
 }
 
 
-def is_whole(frame: LidarFrame) -> bool:
+def is_whole(frame: PointCloud) -> bool:
     """Whether the points lie all around the sensor, not in a camera's view only."""
     turn = np.arctan2(frame.xyz[:, 1], frame.xyz[:, 0]) / (2 * np.pi) + 0.5
     return len(np.unique((turn * SECTORS).astype(int) % SECTORS)) >= WHOLE
 
 
-def scan_rows(frame: LidarFrame, params: PipelineParams = PipelineParams()) -> dict:
+def scan_rows(frame: PointCloud, params: PipelineParams = PipelineParams()) -> dict:
     """Curve to its rows (1, B) of one whole scan; params are those of the clusters. Ground is what
     the cloth finds."""
     xyz, bins = frame.xyz, len(RANGES) - 1
@@ -129,7 +129,7 @@ def scan_rows(frame: LidarFrame, params: PipelineParams = PipelineParams()) -> d
     return {curve: np.atleast_2d(np.asarray(row, float)) for curve, row in rows.items()}
 
 
-def object_rows(frame: LidarFrame, truth: GroundTruth, camera: Camera | None) -> dict:
+def object_rows(frame: PointCloud, truth: GroundTruth, camera: Camera | None) -> dict:
     """Curve to the rows (K, B) of the labelled objects with a point that the camera sees whole: of
     the others KITTI's labels and cropped scans hold a part; of all without a camera. Occluded ones,
     as their labels say, count for `points of all` and intensity only."""

@@ -26,16 +26,16 @@ from lidar_perception.candidates.segmented_cloud import (
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.ground.segment import crop_with_sensor_pose, segment_ground
 from lidar_perception.groups import renumber_ids
-from lidar_perception.types import LidarFrame, as_frame, check_columns
+from lidar_perception.types import PointCloud, as_point_cloud, check_columns
 
 
-def segment_cloud(cloud: LidarFrame | ArrayLike, camera: Camera | None = None,
+def segment_cloud(cloud: PointCloud | ArrayLike, camera: Camera | None = None,
                   params: PipelineParams = PipelineParams(), *, ground: np.ndarray | None = None,
                   cluster_ids: np.ndarray | None = None) -> SegmentedCloud:
     """Run the stages up to the boxes.
 
     Args:
-        cloud: a LidarFrame, or an array (N, 3) or (N, 4) as LidarFrame.of takes it.
+        cloud: a PointCloud, or an array (N, 3) or (N, 4) as PointCloud.of takes it.
         ground, cluster_ids: (N,) bool and (N,) ids from any clustering; computed if None.
 
     Raises:
@@ -43,7 +43,7 @@ def segment_cloud(cloud: LidarFrame | ArrayLike, camera: Camera | None = None,
             another length.
     """
     t0 = perf_counter()
-    frame = as_frame(cloud)
+    frame = as_point_cloud(cloud)
     check_columns(len(frame), ground=ground, cluster_ids=cluster_ids)
     kept, frame = crop_with_sensor_pose(frame, params.crop, params.ground.sensor_pose)
     indices, seen = crop_to_view(frame, camera, params.view)
@@ -65,7 +65,7 @@ def segment_cloud(cloud: LidarFrame | ArrayLike, camera: Camera | None = None,
                           ms={k: v * 1e3 for k, v in ms.items()})
 
 
-def find_candidates(cloud: LidarFrame | ArrayLike, seed: SeedSource, camera: Camera | None = None,
+def find_candidates(cloud: PointCloud | ArrayLike, seed: SeedSource, camera: Camera | None = None,
                     params: PipelineParams = PipelineParams(),
                     **columns: np.ndarray | None) -> tuple[SegmentedCloud, Candidates]:
     """Run the whole pipeline on one cloud.

@@ -10,7 +10,7 @@ from lidar_perception.camera import Camera
 from lidar_perception.candidates.boxes import snap_to_ground
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.ground.threshold import fit_plane
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
 
@@ -44,7 +44,7 @@ def fit_grounded_boxes(xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndar
                           fit_plane(xyz.compress(ground, axis=0)))
 
 
-def explain_nothing(usable: int, ground: np.ndarray,
+def diagnose_empty(usable: int, ground: np.ndarray,
                     cluster_ids: np.ndarray | None = None) -> str | None:
     """Explain why a cloud has no candidates, with the remedy; None if there is no reason so far.
 
@@ -65,8 +65,8 @@ def explain_nothing(usable: int, ground: np.ndarray,
     return None
 
 
-def crop_to_view(frame: LidarFrame, camera: Camera | None,
-                 params: ViewParams) -> tuple[np.ndarray, LidarFrame]:
+def crop_to_view(frame: PointCloud, camera: Camera | None,
+                 params: ViewParams) -> tuple[np.ndarray, PointCloud]:
     """Keep the points of a frame that are in the camera's view.
 
     Returns:

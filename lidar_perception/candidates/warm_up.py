@@ -13,7 +13,7 @@ from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import EuclideanParams
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.compiling import report_compilation
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 from lidar_perception.wire.params import ViewParams
 
 
@@ -35,6 +35,6 @@ def warm_up() -> None:
             "ground.method": ground, "clustering.method": clustering, "boxes.shape": boxes,
             "clustering.dbscan.join_bands": True, "confidence.enabled": sure,
             "seed.min_confidence": 0.0})
-        find_candidates(LidarFrame(xyz), make_automatic_source(seed, params), forward, params)
+        find_candidates(PointCloud(xyz), make_automatic_source(seed, params), forward, params)
     for threshold in ("local", "global"):  # the tree, which only dense clouds need
         cluster_euclidean(person.astype(np.float32), EuclideanParams(threshold=threshold), -1, 0)

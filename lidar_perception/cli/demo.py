@@ -52,7 +52,7 @@ from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.scoring.recorded import Answered, answered
 from lidar_perception.tracking.ego import NO_SOURCE
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError, class_ids
-from lidar_perception.wire.messages import read_column, to_detections, to_frame, to_truth
+from lidar_perception.wire.messages import read_column, to_detections, to_point_cloud, to_truth
 from lidar_perception.wire.topics import POINTS
 from lidar_perception.wire.track_markers import read_trails
 from msg_utils.markers import from_marker_array
@@ -272,7 +272,7 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
                 drawing = msg
     if drawing is None:
         return False
-    frame, indices = to_frame(drawing)
+    frame, indices = to_point_cloud(drawing)
     ground = read_column(drawing, "ground", indices)
     ids = read_column(drawing, "cluster_id", indices)
     none = np.zeros(len(frame), int)

@@ -9,15 +9,15 @@ from lidar_perception.clustering.dbscan import distance_aware_dbscan
 from lidar_perception.clustering.density import adapt_to_density, compute_radii, measure_density
 from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import ClusteringParams
-from lidar_perception.types import LidarFrame, as_frame, check_columns, usable_returns
+from lidar_perception.types import PointCloud, as_point_cloud, check_columns, usable_returns
 
 
-def cluster(cloud: LidarFrame | ArrayLike, params: ClusteringParams = ClusteringParams(),
+def cluster(cloud: PointCloud | ArrayLike, params: ClusteringParams = ClusteringParams(),
             density: float = 0.0) -> np.ndarray:
     """Cluster the points of a cloud.
 
     Args:
-        cloud: a LidarFrame, or an array (N, 3) or (N, 4) as LidarFrame.of takes it.
+        cloud: a PointCloud, or an array (N, 3) or (N, 4) as PointCloud.of takes it.
         density: points per square degree of view, which is compared with params.density; 0 applies
             the parameters unchanged.
 
@@ -28,7 +28,7 @@ def cluster(cloud: LidarFrame | ArrayLike, params: ClusteringParams = Clustering
     Raises:
         InputError: for an array of another shape or type.
     """
-    xyz = as_frame(cloud).xyz
+    xyz = as_point_cloud(cloud).xyz
     usable = usable_returns(xyz)
     if usable.all():
         return _cluster_usable(xyz, params, density)
@@ -46,7 +46,7 @@ def _cluster_usable(xyz: np.ndarray, given: ClusteringParams, density: float) ->
     return cluster_euclidean(xyz, params.euclidean, radii=radii)
 
 
-def cluster_obstacles(cloud: LidarFrame | ArrayLike, ground: np.ndarray,
+def cluster_obstacles(cloud: PointCloud | ArrayLike, ground: np.ndarray,
                       params: ClusteringParams = ClusteringParams(),
                       sensor_xyz: np.ndarray | None = None) -> np.ndarray:
     """Cluster the points of a cloud that are not ground.
@@ -64,7 +64,7 @@ def cluster_obstacles(cloud: LidarFrame | ArrayLike, ground: np.ndarray,
     Raises:
         InputError: for a ground of another length.
     """
-    xyz, ground = as_frame(cloud).xyz, np.asarray(ground, bool)
+    xyz, ground = as_point_cloud(cloud).xyz, np.asarray(ground, bool)
     check_columns(len(xyz), ground=ground)
     labels = np.zeros(len(xyz), np.int32)
     obstacles = np.flatnonzero(~ground)

@@ -31,7 +31,7 @@ from lidar_perception.data.frame import (
 )
 from lidar_perception.data.open_storage import list_storage_files
 from lidar_perception.data.recorded_scale import MAX_READ, infer_scale
-from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, PointCloud
 from lidar_perception.wire.clouds import (
     CLOUD_TYPES,
     check_readable,
@@ -43,7 +43,7 @@ from lidar_perception.wire.messages import (
     read_calibration,
     read_column,
     read_raw_intensity,
-    to_frame,
+    to_point_cloud,
     to_truth,
 )
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, INSTANCE, POINTS, SEMANTIC, TRUTH
@@ -116,7 +116,7 @@ class BagFrames(Sequence):
         self.handle, self.points, self.kind, self.clouds = handle, points, kind, count
         self.path, self.sensor_height = handle.path, sensor_height
 
-    def mounted_at(self, sensor_height: float) -> BagFrames:
+    def with_sensor_height(self, sensor_height: float) -> BagFrames:
         """Return the frames with another sensor height above the ground, in metres."""
         return BagFrames(self.handle, self.points, self.kind, self.clouds, sensor_height)
 
@@ -255,9 +255,9 @@ class BagFrames(Sequence):
                      files=self.files, native=lambda: decode_cloud(data(), self.kind),
                      intensity_max=lambda: self.full_scale)
 
-    def _load(self, time: int, data: Callable[[], bytes]) -> LidarFrame:
+    def _load(self, time: int, data: Callable[[], bytes]) -> PointCloud:
         with self._error_context(time):
-            return to_frame(decode_cloud(data(), self.kind), self.full_scale)[0]
+            return to_point_cloud(decode_cloud(data(), self.kind), self.full_scale)[0]
 
     @contextmanager
     def _error_context(self, time: int) -> Iterator[None]:
@@ -279,7 +279,7 @@ class BagFrames(Sequence):
         if (msg := self.decode_labelled(data())) is None:
             return None
         with self._error_context(time):
-            indices = to_frame(msg)[1]
+            indices = to_point_cloud(msg)[1]
             classes, instances = (read_column(msg, name, indices) for name in (SEMANTIC, INSTANCE))
         assert classes is not None and instances is not None  # see decode_labelled
         return PointTruth(classes.astype(np.uint16), instances.astype(np.uint16))

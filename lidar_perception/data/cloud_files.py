@@ -15,9 +15,9 @@ from lidar_perception.data.ply import read_ply
 from lidar_perception.data.recorded_scale import make_scale_reader
 from lidar_perception.data.records import read_records
 from lidar_perception.runs.files import check_regular, shorten_error
-from lidar_perception.types import MAX_RANGE, InputError, LidarFrame
+from lidar_perception.types import MAX_RANGE, InputError, PointCloud
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import read_raw_intensity, to_frame
+from lidar_perception.wire.messages import read_raw_intensity, to_point_cloud
 from msg_utils.point_cloud2 import from_array, xyz
 from msg_utils.stamps import header_message
 
@@ -40,7 +40,7 @@ def make_cloud_scale_reader(files: Sequence[Path]) -> Callable[[], float]:
 
 
 def load_points(file: Path, stamp_ns: int, frame_id: str = "", *,
-                scale: Callable[[], float]) -> LidarFrame:
+                scale: Callable[[], float]) -> PointCloud:
     """Read the usable points of a file of SUFFIXES.
 
     Args:
@@ -52,7 +52,7 @@ def load_points(file: Path, stamp_ns: int, frame_id: str = "", *,
     """
     try:
         message = to_message(file, stamp_ns, frame_id)
-        frame = to_frame(message, scale())[0]
+        frame = to_point_cloud(message, scale())[0]
     except InputError as error:
         raise InputError(str(error) if str(file) in str(error) else f"{file}: {error}") from None
     if len(frame) == 0:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.camera import Calibration, Camera
-from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, PointCloud
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Frame:
 
     name: str
     stamp_ns: int
-    load: Callable[[], LidarFrame]
+    load: Callable[[], PointCloud]
     truth: Callable[[], GroundTruth | None] = return_none
     point_truth: Callable[[], PointTruth | None] = return_none
     calibration: Callable[[], Calibration | None] = return_none
@@ -90,7 +90,7 @@ class Frame:
         return replace(self, load=cache(self.load))
 
     @staticmethod
-    def of(name: str, scan: LidarFrame, truth: GroundTruth | None = None,
+    def of(name: str, scan: PointCloud, truth: GroundTruth | None = None,
            calibration: Calibration | None = None, **more: Any) -> Frame:
         """Make a frame of data in memory."""
         return Frame(name, scan.stamp_ns, partial(_identity, scan), partial(_identity, truth),

@@ -14,8 +14,8 @@ from lidar_perception.robot.deskew import PoseLookup
 from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placement import find_level_transform, make_tilted_pose
 from lidar_perception.robot.poses import invert_pose, transform_boxes, transform_points
-from lidar_perception.types import GroundTruth, LidarFrame
-from lidar_perception.wire.messages import to_frame
+from lidar_perception.types import GroundTruth, PointCloud
+from lidar_perception.wire.messages import to_point_cloud
 from lidar_perception.wire.point_times import deskew_frame
 from lidar_perception.wire.topics import LIDAR_FRAME
 
@@ -55,16 +55,16 @@ def level_frame(frame: Frame, mount: SensorMount, poses: PoseLookup | None = Non
     rotation = find_level_transform(make_tilted_pose(mount.roll, mount.pitch), mount.ahead)
     inverse_rotation = np.eye(4) if rotation is None else invert_pose(rotation)
 
-    def read() -> tuple[np.ndarray, LidarFrame]:
+    def read() -> tuple[np.ndarray, PointCloud]:
         """Return the indices of the points that are kept, and these points."""
         message = frame.native()
-        scan, indices = to_frame(message, mount.intensity_max or frame.intensity_max())
+        scan, indices = to_point_cloud(message, mount.intensity_max or frame.intensity_max())
         kept, scan = crop_frame(scan, mount.crop, level=rotation)
         if poses is not None:
             scan = deskew_frame(message, scan, indices.take(kept), poses)
         return kept, scan
 
-    def load() -> LidarFrame:
+    def load() -> PointCloud:
         scan = read()[1]
         return scan if rotation is None else replace(
             scan, xyz=transform_points(scan.xyz, rotation),

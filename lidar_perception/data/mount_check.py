@@ -11,7 +11,7 @@ from lidar_perception.data.frame import Recording
 from lidar_perception.ground.params import SensorPoseParams, ThresholdParams
 from lidar_perception.ground.segment import level_points
 from lidar_perception.ground.threshold import fit_plane_by_ransac
-from lidar_perception.types import SENSOR_HEIGHT, InputError, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
 # The floor is fitted beyond the vehicle, and near enough for one plane.
 MIN_RANGE_M, MAX_RANGE_M = 2.5, 25.0
@@ -45,7 +45,7 @@ def find_height_problem(measured: float | None, pose: SensorPoseParams) -> str |
             f"{pose.height:g}; set it to {measured:.2f}")
 
 
-def load_first_clouds(recording: Recording) -> list[LidarFrame]:
+def load_first_clouds(recording: Recording) -> list[PointCloud]:
     """Load the clouds that the check of a recording needs.
 
     The list is empty if one of them cannot be read: the caller that needs it reports the error.
@@ -56,7 +56,7 @@ def load_first_clouds(recording: Recording) -> list[LidarFrame]:
         return []
 
 
-def apply_measured_height(recording: Recording, clouds: Sequence[LidarFrame]) -> Recording:
+def apply_measured_height(recording: Recording, clouds: Sequence[PointCloud]) -> Recording:
     """Reopen a recording with the sensor height that its first clouds show.
 
     The recording itself is returned if it states the height, if its clouds disagree, or if the
@@ -73,7 +73,7 @@ def apply_measured_height(recording: Recording, clouds: Sequence[LidarFrame]) ->
     return recording.reopen(sensor_height=height)
 
 
-def find_mount_problem(recording: Recording, clouds: Sequence[LidarFrame]) -> str | None:
+def find_mount_problem(recording: Recording, clouds: Sequence[PointCloud]) -> str | None:
     """Describe a sensor that leans or is upside down, by the first clouds, with the remedy.
 
     None if the sensor is level, or if fewer than two clouds show a floor.
@@ -103,7 +103,7 @@ def _find_floor(xyz: np.ndarray, params: ThresholdParams = FLOOR_PLANE) -> np.nd
     return plane if on_plane.mean() >= MIN_FLOOR_SHARE else None
 
 
-def _find_floors(clouds: Sequence[LidarFrame],
+def _find_floors(clouds: Sequence[PointCloud],
                  params: ThresholdParams = FLOOR_PLANE) -> np.ndarray:
     """Return the planes (K, 3) of the clouds that have a floor."""
     return np.array([plane for cloud in clouds if len(cloud)

@@ -84,7 +84,7 @@ def open_recording(path: str | Path, *, split: str | Path | None = None, points:
     if sensor_height is not None:
         frames = recording.frames
         recording = replace(recording, has_sensor_height=True, frames=(
-            frames.mounted_at(sensor_height) if isinstance(frames, bag_frames.BagFrames)
+            frames.with_sensor_height(sensor_height) if isinstance(frames, bag_frames.BagFrames)
             else [replace(frame, sensor_height=sensor_height) for frame in frames]))
     recording = replace(recording, reopen=partial(
         open_recording, path, split=split, points=points, scans=scans,

@@ -11,7 +11,7 @@ import numpy as np
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import LATCHED_QOS, BagWriter
 from lidar_perception.data.frame import Frame, PointTruth
-from lidar_perception.types import GroundTruth, InputError, LidarFrame
+from lidar_perception.types import GroundTruth, InputError, PointCloud
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import (
     make_camera_info,
@@ -147,7 +147,7 @@ class FrameWriter:
             bag.write(POINTS, stamp_ns, from_array(points, header, bag_message))
 
 
-def to_point_array(scan: LidarFrame, labels: PointTruth | None = None) -> np.ndarray:
+def to_point_array(scan: PointCloud, labels: PointTruth | None = None) -> np.ndarray:
     """Return points as structured array (N,): POINT (without intensity if the scan has none), plus
     POINT_LABELS if labels are given."""
     fields = POINT.descr[:4 if scan.intensity is not None else 3]

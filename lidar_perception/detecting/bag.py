@@ -12,7 +12,7 @@ from lidar_perception.data.frame import return_none
 from lidar_perception.data.to_bag import DETECTIONS_3D, MARKERS, FrameWriter
 from lidar_perception.detecting.formats import Run
 from lidar_perception.detecting.results import FrameResult
-from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
+from lidar_perception.types import CLASSES, Detections, InputError, PointCloud
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_detection_markers
 from lidar_perception.wire.topics import FOUND, TRACKS
@@ -50,7 +50,7 @@ class Bag:
         """Write a frame. One that no bag can hold is added to the skipped ones instead."""
         frame = result.frame
         if not self.clouds:  # then nothing but its frame is needed of it
-            nobody = LidarFrame(np.zeros((0, 3), np.float32), frame_id=result.frame_id)
+            nobody = PointCloud(np.zeros((0, 3), np.float32), frame_id=result.frame_id)
             frame = replace(frame, load=lambda: nobody)
         try:
             content = self.writer.read(frame)

@@ -9,12 +9,12 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import torch
 
-from lidar_perception.detectors.contract import Cloud, Found, accept, joined
+from lidar_perception.detectors.contract import Cloud, DetectionResult, accept, joined
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
 from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.ground.params import SensorPoseParams, set_sensor_height
 from lidar_perception.ground.segment import crop_with_sensor_pose
-from lidar_perception.types import SENSOR_HEIGHT, InputError, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
 
 class NetworkDetector:
@@ -36,7 +36,7 @@ class NetworkDetector:
         raise NotImplementedError
 
     def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
-                 cluster_ids: np.ndarray | None = None) -> Found:
+                 cluster_ids: np.ndarray | None = None) -> DetectionResult:
         """Return the objects in a cloud, see contract.Detector.
 
         Raises:
@@ -52,8 +52,8 @@ class NetworkDetector:
         found = self.detect(frame, ground, cluster_ids)
         return replace(found, problem=joined(problem, found.problem)) if problem else found
 
-    def detect(self, frame: LidarFrame, ground: np.ndarray | None,
-               cluster_ids: np.ndarray | None) -> Found:
+    def detect(self, frame: PointCloud, ground: np.ndarray | None,
+               cluster_ids: np.ndarray | None) -> DetectionResult:
         """Return the objects in a frame that is checked and cropped already."""
         raise NotImplementedError
 
@@ -104,7 +104,7 @@ class NetworkDetector:
         settings = replace(self.settings, scores=ScoreParams.all_alike(min_score))
         return self.with_params(replace(self.params, **{self.group: settings}))
 
-    def mounted_at(self, height: float) -> Self:
+    def with_sensor_height(self, height: float) -> Self:
         """Return this detector for a sensor mounted `height` metres above the ground."""
         return self.with_params(set_sensor_height(self.params, height))
 
@@ -128,11 +128,11 @@ class NetworkDetector:
         raise NotImplementedError
 
 
-def make_synthetic_frame(pose: SensorPoseParams) -> LidarFrame:
+def make_synthetic_frame(pose: SensorPoseParams) -> PointCloud:
     """Return flat ground with one object on it, for the first run of a detector."""
     rng = np.random.default_rng(0)
     ground = rng.uniform(0, 40, (2000, 3)) * [1, 1, 0.001] - [0, 20, SENSOR_HEIGHT]
     target = rng.uniform(-0.5, 0.5, (400, 3)) + [8, 0, -0.8]
     xyz = np.concatenate([ground, target]).astype(np.float32)
     xyz[:, 2] -= pose.height - SENSOR_HEIGHT
-    return LidarFrame(xyz, np.zeros(len(xyz), np.float32))
+    return PointCloud(xyz, np.zeros(len(xyz), np.float32))

@@ -11,8 +11,8 @@ from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import SeedSource
-from lidar_perception.candidates.segmented_cloud import explain_nothing
-from lidar_perception.detectors.contract import Cloud, Found, accept
+from lidar_perception.candidates.segmented_cloud import diagnose_empty
+from lidar_perception.detectors.contract import Cloud, DetectionResult, accept
 from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, PEDESTRIAN
@@ -48,16 +48,16 @@ class CandidateDetector:
         return CandidateDetector(self.seed, self.camera,
                                  with_values(self.params, {self._threshold: min_score}))
 
-    def mounted_at(self, height: float) -> CandidateDetector:
+    def with_sensor_height(self, height: float) -> CandidateDetector:
         """The same detector for a sensor so many metres above the ground."""
         return CandidateDetector(self.seed, self.camera, set_sensor_height(self.params, height))
 
     def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
-                 cluster_ids: np.ndarray | None = None) -> Found:
+                 cluster_ids: np.ndarray | None = None) -> DetectionResult:
         """See contract.Detector. InputError where there is no seed, and without a camera where
         params crop to its view."""
         frame, ground, cluster_ids, _ = accept(cloud, ground, cluster_ids)
         segmented, candidates = find_candidates(frame, self.seed, self.camera, self.params,
                                                 ground=ground, cluster_ids=cluster_ids)
-        return Found(candidates.final, candidates.ms,
-                     explain_nothing(len(frame), segmented.ground, segmented.cluster_ids))
+        return DetectionResult(candidates.final, candidates.ms,
+                     diagnose_empty(len(frame), segmented.ground, segmented.cluster_ids))

@@ -14,14 +14,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidar_perception.intensity import find_scale_problem, guess_scale, to_unit
-from lidar_perception.types import Detections, LidarFrame, as_frame, check_columns, usable_returns
+from lidar_perception.types import (
+    Detections,
+    PointCloud,
+    as_point_cloud,
+    check_columns,
+    usable_returns,
+)
 
-Cloud = LidarFrame | ArrayLike  # see LidarFrame.of
+Cloud = PointCloud | ArrayLike  # see PointCloud.of
 FUSED = "fused"  # the default where one detector is wanted: all of them together
 
 
 @dataclass(frozen=True)
-class Found:
+class DetectionResult:
     """The result of a detector for one cloud.
 
     Attributes:
@@ -38,7 +44,7 @@ class Found:
 
 
 class Detector(Protocol):
-    """detector(cloud) -> Found. classes: names of types.CLASSES that it can detect."""
+    """detector(cloud) -> DetectionResult. classes: names of types.CLASSES that it can detect."""
 
     @property
     def classes(self) -> tuple[str, ...]: ...
@@ -50,16 +56,16 @@ class Detector(Protocol):
     def with_min_score(self, min_score: float) -> Self:
         """The same detector with this least score for every class; this one stays as it is."""
 
-    def mounted_at(self, height: float) -> Self:
+    def with_sensor_height(self, height: float) -> Self:
         """The same detector for a sensor so many metres above the ground; this one stays as it
         is."""
 
     def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
-                 cluster_ids: np.ndarray | None = None) -> Found:
+                 cluster_ids: np.ndarray | None = None) -> DetectionResult:
         """Return the objects in a cloud of N points, N may be 0.
 
         Args:
-            cloud: a LidarFrame, or an array as LidarFrame.of takes it: (N, 3) [x y z] or (N, 4)
+            cloud: a PointCloud, or an array as PointCloud.of takes it: (N, 3) [x y z] or (N, 4)
                 [x y z intensity], metres, x forward, y left, z up.
             ground: (N,) bool from a stage before; computed where it is None and needed.
             cluster_ids: (N,) int, 0 and below = none; computed where it is None and needed.
@@ -73,7 +79,7 @@ class Accepted(NamedTuple):
     """Checked arguments of a detector: the usable points of the cloud with the intensity in 0..1,
     their columns, and the find_scale_problem() of the intensity."""
 
-    frame: LidarFrame
+    frame: PointCloud
     ground: np.ndarray | None
     cluster_ids: np.ndarray | None
     problem: str | None = None
@@ -87,7 +93,7 @@ def accept(cloud: Cloud, ground: np.ndarray | None, cluster_ids: np.ndarray | No
 
     intensity_scale: the factor by which the detector multiplies the intensity; 0: it reads none.
     """
-    frame = as_frame(cloud)
+    frame = as_point_cloud(cloud)
     check_columns(len(frame), ground=ground, cluster_ids=cluster_ids)
     ground = None if ground is None else np.asarray(ground, bool)
     cluster_ids = None if cluster_ids is None else np.asarray(cluster_ids)

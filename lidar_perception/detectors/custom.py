@@ -18,7 +18,7 @@ from typing import Any, cast
 import numpy as np
 
 from lidar_perception.classes import DETECTED
-from lidar_perception.detectors.contract import Cloud, Detector, Found, accept
+from lidar_perception.detectors.contract import Cloud, DetectionResult, Detector, accept
 from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.param_fields import Params
@@ -27,7 +27,7 @@ from lidar_perception.types import (
     CLASSES,
     Detections,
     InputError,
-    LidarFrame,
+    PointCloud,
     RunError,
     did_you_mean,
     unknown_name,
@@ -74,7 +74,7 @@ class CustomDetector:
     """
 
     name: str
-    build: Callable[[float], Callable[[LidarFrame], Any]]
+    build: Callable[[float], Callable[[PointCloud], Any]]
     classes: tuple[str, ...] = tuple(DETECTED)
     params: Any = field(default_factory=CustomDetectorParams)
     group: str = "custom"
@@ -99,14 +99,14 @@ class CustomDetector:
         own = replace(getattr(self.params, self.group), scores=ScoreParams.all_alike(min_score))
         return self.with_params(replace(self.params, **{self.group: own}))
 
-    def mounted_at(self, height: float) -> CustomDetector:
+    def with_sensor_height(self, height: float) -> CustomDetector:
         """Return this detector for a sensor mounted `height` metres above the ground."""
         pose = replace(self.params.ground.sensor_pose, height=height)
         return self.with_params(replace(
             self.params, ground=replace(self.params.ground, sensor_pose=pose)))
 
     def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
-                 cluster_ids: np.ndarray | None = None) -> Found:
+                 cluster_ids: np.ndarray | None = None) -> DetectionResult:
         """See contract.Detector; ground and cluster_ids are checked and not used.
 
         Raises:
@@ -124,10 +124,10 @@ class CustomDetector:
             raise RunError(f"{self.name} returned {type(found).__name__}; a detector returns "
                            "Detections, such as lidar_perception.Detections.of(boxes, class_ids, "
                            "scores)")
-        return Found(found[self.scores.passed(found)], {"detect": milliseconds}, problem)
+        return DetectionResult(found[self.scores.passed(found)], {"detect": milliseconds}, problem)
 
 
-def as_detector(detector: Detector | Callable[[LidarFrame], Detections]) -> Detector:
+def as_detector(detector: Detector | Callable[[PointCloud], Detections]) -> Detector:
     """Return a detector as it is, and any other function of a cloud in an adapter.
 
     Raises:
@@ -178,7 +178,7 @@ def load_custom_detector(reference: str, device: str = "auto", range: str = "aut
               if name in taken}
 
     @lru_cache(maxsize=2)
-    def build(height: float | None) -> Callable[[LidarFrame], Any]:
+    def build(height: float | None) -> Callable[[PointCloud], Any]:
         own = values if height is None else {**values, "sensor_height": height}
         try:
             detector = make(**own)

@@ -22,7 +22,8 @@ def _vector_width() -> int:
     nothing, or the kernel is not tested."""
     triple, _, features = cpu_target.target_context.codegen().magic_tuple()
     enabled = features.split(",")
-    if config.DISABLE_JIT or not triple.startswith("x86_64") or "+fma" not in enabled:
+    disabled = config.DISABLE_JIT  # type: ignore[attr-defined]  # numba sets it at run time
+    if disabled or not triple.startswith("x86_64") or "+fma" not in enabled:
         return 0
     return 16 if "+avx512f" in enabled else 8 if "+avx2" in enabled else 0
 

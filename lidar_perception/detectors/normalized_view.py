@@ -11,7 +11,7 @@ from lidar_perception.geometry import wrap_angle
 from lidar_perception.ground.params import GroundParams, SensorPoseParams
 from lidar_perception.ground.segment import level_points, segment_ground
 from lidar_perception.intensity import MIN_POINTS
-from lidar_perception.types import SENSOR_HEIGHT, Detections, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, Detections, PointCloud
 
 MAX_MAST_M = 1.0     # a car farther below the sensor passes under a gantry
 MAX_ROOF_GAP_M = 1.0  # less than half of a car's width and the gap to the next car
@@ -31,14 +31,14 @@ class NormalizedView:
         intensity_scale: factor of the intensity; 0: the view has none.
     """
 
-    frame: LidarFrame
+    frame: PointCloud
     indices: np.ndarray
-    source: LidarFrame
+    source: PointCloud
     pose: SensorPoseParams
     intensity_scale: float
 
     @staticmethod
-    def of(source: LidarFrame, pose: SensorPoseParams = SensorPoseParams(),
+    def of(source: PointCloud, pose: SensorPoseParams = SensorPoseParams(),
            low: Corner | None = None, high: Corner | None = None,
            intensity_scale: float = 1.0) -> NormalizedView:
         """Return the view of a cloud.
@@ -90,14 +90,14 @@ def _scale_intensity(intensity: np.ndarray | None, scale: float) -> np.ndarray |
     return None if intensity is None or not scale else intensity * np.float32(scale)
 
 
-def crop_to_range(frame: LidarFrame, low: Corner, high: Corner) -> tuple[np.ndarray, LidarFrame]:
+def crop_to_range(frame: PointCloud, low: Corner, high: Corner) -> tuple[np.ndarray, PointCloud]:
     """Return the points of a frame with low <= x y z < high: their indices (M,) int64, and the
     frame of them."""
     indices = _indices_in_range(frame.xyz, np.array(low, np.float32), np.array(high, np.float32))
     return indices, frame.take(indices)
 
 
-def segment_view_ground(frame: LidarFrame, params: GroundParams) -> np.ndarray:
+def segment_view_ground(frame: PointCloud, params: GroundParams) -> np.ndarray:
     """Return which points of the frame of a NormalizedView are ground, (M,) bool. The sensor pose
     in `params` is not used."""
     return segment_ground(frame, replace(params, sensor_pose=SensorPoseParams()))
@@ -106,7 +106,7 @@ def segment_view_ground(frame: LidarFrame, params: GroundParams) -> np.ndarray:
 def restore_detections(detections: Detections, pose: SensorPoseParams) -> Detections:
     """Return detections of a NormalizedView in the coordinates of a sensor with this pose, without
     the vehicle that carries it."""
-    return to_sensor_frame(without_carrier(detections, pose.height), pose)
+    return to_sensor_frame(drop_ego_vehicle(detections, pose.height), pose)
 
 
 def to_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detections:
@@ -121,7 +121,7 @@ def to_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detection
     return replace(detections, boxes=boxes)
 
 
-def without_carrier(detections: Detections, height: float) -> Detections:
+def drop_ego_vehicle(detections: Detections, height: float) -> Detections:
     """Return the detections of a NormalizedView without the vehicle that carries the sensor.
 
     Dropped are boxes that contain the sensor, or are less than MAX_MAST_M above or below it. As a
@@ -142,7 +142,7 @@ def without_carrier(detections: Detections, height: float) -> Detections:
     return detections[~is_carrier] if is_carrier.any() else detections
 
 
-def rotate_half_turn(frame: LidarFrame) -> LidarFrame:
+def rotate_half_turn(frame: PointCloud) -> PointCloud:
     """Return the frame rotated by 180 degrees about z, without rounding."""
     return replace(frame, xyz=frame.xyz * np.array([-1, -1, 1], np.float32))
 

@@ -101,7 +101,7 @@ def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
         if reference is None and range != "auto" and f"{kind}.range" not in settings:
             detector = detector.with_range(range)
         if sensor_height is not None:
-            detector = detector.mounted_at(sensor_height)
+            detector = detector.with_sensor_height(sensor_height)
         if min_score is not None:
             detector = detector.with_min_score(min_score)
         if settings:

@@ -13,7 +13,7 @@ from lidar_perception.intensity import guess_scale, to_unit
 from lidar_perception.robot.crop import crop_frame
 from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placement import find_level_transform, make_tilted_pose
-from lidar_perception.types import LidarFrame, as_frame, usable_returns
+from lidar_perception.types import PointCloud, as_point_cloud, usable_returns
 
 METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool
     "threshold": lambda xyz, intensity, p: segment_by_threshold(xyz, p.threshold,
@@ -24,12 +24,12 @@ METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool
 }
 
 
-def segment_ground(cloud: LidarFrame | ArrayLike,
+def segment_ground(cloud: PointCloud | ArrayLike,
                    params: GroundParams = GroundParams()) -> np.ndarray:
     """Segment the ground of a cloud.
 
     Args:
-        cloud: a LidarFrame, or an array (N, 3) or (N, 4) as LidarFrame.of takes it. It is not
+        cloud: a PointCloud, or an array (N, 3) or (N, 4) as PointCloud.of takes it. It is not
             modified; sensor_pose levels a copy of the points.
 
     Returns:
@@ -39,7 +39,7 @@ def segment_ground(cloud: LidarFrame | ArrayLike,
     Raises:
         InputError: for an array of another shape or type.
     """
-    frame = as_frame(cloud)
+    frame = as_point_cloud(cloud)
     usable = usable_returns(frame.xyz)
     if usable.all():
         return _segment(frame.xyz, frame.intensity, params)
@@ -66,8 +66,8 @@ def level_points(xyz: np.ndarray, pose: SensorPoseParams) -> np.ndarray:
     return xyz @ make_tilted_pose(pose.roll, pose.pitch)[:3, :3].T.astype(np.float32)
 
 
-def crop_with_sensor_pose(frame: LidarFrame, crop: CropParams,
-                          pose: SensorPoseParams) -> tuple[np.ndarray, LidarFrame]:
+def crop_with_sensor_pose(frame: PointCloud, crop: CropParams,
+                          pose: SensorPoseParams) -> tuple[np.ndarray, PointCloud]:
     """Crop a frame as robot.crop.cropped does, with sectors as a level sensor would see them."""
     return crop_frame(frame, crop,
                       level=find_level_transform(make_tilted_pose(pose.roll, pose.pitch)))

@@ -16,7 +16,7 @@ from lidar_perception.nodes.outputs import CandidateOutputs
 from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.params import DetectionNodeParams, RefinementNodeParams
 from lidar_perception.types import InputError
-from lidar_perception.wire.messages import read_cluster_ids, read_column, to_frame
+from lidar_perception.wire.messages import read_cluster_ids, read_column, to_point_cloud
 from msg_utils.stamps import to_ns
 
 __all__ = ["CandidateRefinement", "warm_up"]
@@ -36,7 +36,7 @@ class CandidateRefinement(ManagedNode):
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, indices = to_frame(msg)
+            frame, indices = to_point_cloud(msg)
             frame = self.transforms.placing(msg.header).level_frame(frame)
             ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
             if clusters is None:

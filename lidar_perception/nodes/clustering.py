@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.candidates.segmented_cloud import explain_nothing, fit_grounded_boxes
+from lidar_perception.candidates.segmented_cloud import diagnose_empty, fit_grounded_boxes
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.nodes.managed import ManagedNode
@@ -14,7 +14,7 @@ from lidar_perception.nodes.outputs import ClusterBoxes
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.params import BoxNodeParams, ClusteringNodeParams
 from lidar_perception.wire.codec import bag_message, encode
-from lidar_perception.wire.messages import read_column, scatter_values, to_frame
+from lidar_perception.wire.messages import read_column, scatter_values, to_point_cloud
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
 
@@ -37,7 +37,7 @@ class Clustering(ManagedNode):
 
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, indices = to_frame(msg)
+            frame, indices = to_point_cloud(msg)
             frame = self.transforms.placing(msg.header).level_frame(frame)
             column = read_column(msg, "ground", indices)
             ground = np.zeros(len(frame), bool) if column is None else column > 0
@@ -51,5 +51,5 @@ class Clustering(ManagedNode):
             self.report(WARN, "the cloud has no column 'ground', so all points are clustered; "
                         "remap ~/input/points to the output of the ground segmentation")
         else:
-            problem = explain_nothing(len(frame), ground, ids)
+            problem = diagnose_empty(len(frame), ground, ids)
             self.report(WARN if problem else OK, problem or "clustering")

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from lidar_perception.detectors.contract import Found, joined
+from lidar_perception.detectors.contract import DetectionResult, joined
 from lidar_perception.detectors.params import NetworkParams
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import DetectionOutputs
@@ -14,7 +14,7 @@ from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.runs.compiling import lock_compilation, report_compilation
 from lidar_perception.runs.machine import count_cores
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.messages import read_cluster_ids, read_column
 from msg_utils.stamps import to_ns
 
@@ -106,7 +106,7 @@ class DetectorNode(ManagedNode):
         low = network_params.scores.at_most(self.node_params.tracking.min_score)
         return replace(params, **{self.group: replace(network_params, scores=low)})
 
-    def _diagnose(self, frame: LidarFrame, result: Found, params: Any,
+    def _diagnose(self, frame: PointCloud, result: DetectionResult, params: Any,
                   tracking_problem: str | None) -> None:
         # The problem of the detector includes those of the intensity.
         problem = joined(result.problem, self.sensor.check_height(

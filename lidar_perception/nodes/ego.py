@@ -15,7 +15,7 @@ from lidar_perception.robot.transform_tree import MissingTransform, TransformTre
 from lidar_perception.tracking.ego import NO_SOURCE, Odometry, best_source, has_odometry
 from lidar_perception.tracking.params import EgoParams
 from lidar_perception.types import InputError
-from lidar_perception.wire.messages import to_frame
+from lidar_perception.wire.messages import to_point_cloud
 from msg_utils.stamps import SECOND, to_ns
 
 START, SCAN = "start", "scan"  # frames of KISS-ICP
@@ -213,7 +213,7 @@ class EgoInput:
     def _on_cloud(self, msg: Any) -> None:
         if not self._uses_scans():
             return
-        xyz = to_frame(msg)[0].xyz
+        xyz = to_point_cloud(msg)[0].xyz
         if not len(xyz):
             raise InputError("the cloud has no usable point, so the sensor motion is unknown")
         self._register(msg.header, xyz)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from lidar_perception.candidates.segmented_cloud import crop_to_view, explain_nothing
+from lidar_perception.candidates.segmented_cloud import crop_to_view, diagnose_empty
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.ground.threshold import compute_inlier_share, fit_plane
@@ -61,5 +61,5 @@ class GroundSegmentation(ManagedNode):
             self.counts.update(plane=" ".join(f"{v:.4f}" for v in plane),
                                plane_inlier_share=f"{share:.3f}",
                                ground_share=f"{ground.mean():.3f}")
-        problem = explain_nothing(len(frame), ground) or self.sensor.find_problem(frame, params)
+        problem = diagnose_empty(len(frame), ground) or self.sensor.find_problem(frame, params)
         self.report(WARN if problem else OK, problem or "segmenting")

@@ -7,7 +7,7 @@ from typing import Any
 from lidar_perception.candidates.params import STEPS, PipelineParams
 from lidar_perception.candidates.pipeline import refine_segmented, segment_cloud
 from lidar_perception.candidates.seed_sources import SeedSource
-from lidar_perception.candidates.segmented_cloud import explain_nothing
+from lidar_perception.candidates.segmented_cloud import diagnose_empty
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes.inputs import CameraInput, SeedInput
 from lidar_perception.nodes.managed import ManagedNode
@@ -44,7 +44,7 @@ class Perception(ManagedNode):
         with self.frame(to_ns(msg.header.stamp)):
             frame, usable, params = self.sensor.read_frame(msg)
             segmented = segment_cloud(frame, self.camera.get(msg.header, params.view), params)
-            problem = (explain_nothing(len(frame), segmented.ground, segmented.cluster_ids)
+            problem = (diagnose_empty(len(frame), segmented.ground, segmented.cluster_ids)
                        or self.sensor.find_problem(frame, params))
             self.outputs.publish(msg.header, frame.xyz,
                                  lambda: refine_segmented(segmented, source, params), problem)

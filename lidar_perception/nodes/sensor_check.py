@@ -11,8 +11,8 @@ from lidar_perception.data.mount_check import find_height_problem, measure_senso
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.intensity import StreamScale
 from lidar_perception.robot.params import CropParams
-from lidar_perception.types import LidarFrame
-from lidar_perception.wire.messages import diagnose_intensity, to_frame
+from lidar_perception.types import PointCloud
+from lidar_perception.wire.messages import diagnose_intensity, to_point_cloud
 
 MEASURED_CLOUDS = 5  # for the sensor height
 
@@ -31,7 +31,7 @@ class SensorCheck:
         self.scale = StreamScale()
 
     def read_frame(self, msg: Any, with_intensity: bool = False
-                   ) -> tuple[LidarFrame, np.ndarray, Any]:
+                   ) -> tuple[PointCloud, np.ndarray, Any]:
         """Convert a cloud to a cropped frame, levelled if there is a base_frame.
 
         Args:
@@ -44,8 +44,8 @@ class SensorCheck:
         """
         params = self.node.params
         reads_intensity = with_intensity or params.ground.method == "patchwork"
-        frame, indices = to_frame(msg, params.input.intensity_max if reads_intensity else None,
-                                  self.scale)
+        frame, indices = to_point_cloud(
+            msg, params.input.intensity_max if reads_intensity else None, self.scale)
         placing = self.node.transforms.placing(msg.header)
         params = self.node.transforms.with_mounting(params, placing)
         self.node.counts.pop("cropped", None)
@@ -55,11 +55,11 @@ class SensorCheck:
             indices, params = indices.take(kept), replace(params, crop=CropParams())
         return placing.level_frame(frame), indices, params
 
-    def find_problem(self, frame: LidarFrame, params: Any) -> str | None:
+    def find_problem(self, frame: PointCloud, params: Any) -> str | None:
         """Return what contradicts the parameters of read_frame(), with the remedy, or None."""
         return self.check_height(frame, params.ground.sensor_pose) or diagnose_intensity(frame)
 
-    def check_height(self, frame: LidarFrame, pose: SensorPoseParams) -> str | None:
+    def check_height(self, frame: PointCloud, pose: SensorPoseParams) -> str | None:
         """Return a problem if the measured sensor height differs from that in pose, or None."""
         if pose != self.pose:
             self.pose, self.heights = pose, []

@@ -22,9 +22,9 @@ from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placement import Placement, find_level_transform, make_tilted_pose
 from lidar_perception.robot.poses import invert_pose
 from lidar_perception.robot.transform_tree import MissingTransform, TransformTree
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import to_frame
+from lidar_perception.wire.messages import to_point_cloud
 from lidar_perception.wire.point_times import deskew_points, read_point_times, replace_points
 from lidar_perception.wire.topics import TF, TF_STATIC
 from lidar_perception.wire.transforms import (
@@ -176,7 +176,7 @@ class Transforms:
         """
         if self.sweep is None:
             try:
-                seconds = read_point_times(cloud, to_frame(cloud)[1]).seconds
+                seconds = read_point_times(cloud, to_point_cloud(cloud)[1]).seconds
             except InputError:  # deskew_cloud() reports it
                 return 0.0
             self.sweep = float(seconds[np.isfinite(seconds)].max(initial=0.0))
@@ -240,8 +240,8 @@ class Transforms:
                 params.ground, sensor_pose=SensorPoseParams(height=height)))
         return params
 
-    def crop_frame(self, frame: LidarFrame, crop: CropParams, placing: Placement
-                   ) -> tuple[np.ndarray, LidarFrame]:
+    def crop_frame(self, frame: PointCloud, crop: CropParams, placing: Placement
+                   ) -> tuple[np.ndarray, PointCloud]:
         """Crop a frame, see robot.crop.crop_frame.
 
         The body of the robot is not cropped while base_frame has no transform.
@@ -369,7 +369,7 @@ class Transforms:
         return moved
 
     def _moved(self, msg: Any) -> Any:
-        frame, indices = to_frame(msg)
+        frame, indices = to_point_cloud(msg)
         crop = getattr(self.node.params, "crop", None)
         if crop is not None and crop.enabled:
             kept, frame = self.crop_frame(frame, crop, self.placing(msg.header))

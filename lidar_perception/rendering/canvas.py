@@ -128,7 +128,7 @@ class Canvas:
                         0.0, 1.0)
         column = np.where(steep[owner, None], pixels, cell[:, None])
         row = np.where(steep[owner, None], cell[:, None], pixels)
-        self._blend(column, row, cover * opacity[owner, None], colors[owner])
+        self._blend(column, row, cover * opacity[owner, None], np.asarray(colors)[owner])
 
     def _blend(self, column: np.ndarray, row: np.ndarray, cover: np.ndarray,
                colors: np.ndarray) -> None:

@@ -20,7 +20,7 @@ from lidar_perception.rendering.colors import (
     get_class_color,
 )
 from lidar_perception.rendering.views import NEAR, BirdsEye, Perspective, View, project_lines
-from lidar_perception.types import CLASSES, LidarFrame
+from lidar_perception.types import CLASSES, PointCloud
 
 EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4],
                   [0, 4], [1, 5], [2, 6], [3, 7]])  # of box_corners
@@ -78,7 +78,7 @@ class Stage:
     height: int = 720
 
     @staticmethod
-    def of(scan: LidarFrame, sensor_height: float, ahead: bool, color: str = "height",
+    def of(scan: PointCloud, sensor_height: float, ahead: bool, color: str = "height",
            size: tuple[int, int] = (1280, 720)) -> Stage:
         """Return the stage for a film whose first scan is given."""
         far = np.percentile(horizontal_range(scan.xyz), FAR_PERCENTILE) if len(scan) else MIN_RANGE
@@ -105,14 +105,14 @@ class Stage:
         step = next(step for step in (1, 2, 5, 10, 20) if self.reach <= 6.5 * step)
         return np.arange(step, 1.6 * self.reach, step)
 
-    def colors(self, scan: LidarFrame) -> np.ndarray:
+    def colors(self, scan: PointCloud) -> np.ndarray:
         """Return the colours (N, 3) uint8 of the points of a scan."""
         if self.color == "intensity" and scan.intensity is not None:
             return color_by_intensity(scan.intensity)
         return color_by_height(scan.xyz[:, 2] - np.float32(self.ground))
 
 
-def draw_frame(stage: Stage, scan: LidarFrame, found: Boxes, labels: np.ndarray = NO_BOXES,
+def draw_frame(stage: Stage, scan: PointCloud, found: Boxes, labels: np.ndarray = NO_BOXES,
                title: str = "", time: str = "", colors: np.ndarray | None = None) -> np.ndarray:
     """Draw a frame as an image (height, width, 3) uint8 [r g b].
 

@@ -22,7 +22,7 @@ from lidar_perception.types import (
     SENSOR_HEIGHT,
     GroundTruth,
     InputError,
-    LidarFrame,
+    PointCloud,
 )
 
 VEHICLES = [i for i, row in enumerate(TABLE) if row.vehicle]
@@ -33,7 +33,7 @@ class Labelled:
     """A frame with at least one pedestrian: pedestrians (M, 7) are their true boxes; height: of
     the sensor above the ground, metres."""
 
-    frame: LidarFrame
+    frame: PointCloud
     camera: Camera
     truth: GroundTruth
     height: float = SENSOR_HEIGHT
@@ -42,7 +42,7 @@ class Labelled:
     def pedestrians(self) -> np.ndarray:
         return self.truth.of_class(PEDESTRIAN)
 
-    def segmented(self, params: PipelineParams, scan: LidarFrame | None = None) -> SegmentedCloud:
+    def segmented(self, params: PipelineParams, scan: PointCloud | None = None) -> SegmentedCloud:
         """The frame, or another scan of the same sensor, up to the boxes."""
         return segment_cloud(self.frame if scan is None else scan, self.camera,
                              set_sensor_height(params, self.height))

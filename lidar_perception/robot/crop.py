@@ -6,7 +6,7 @@ import numpy as np
 
 from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.poses import transform_points
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 
 def select_points(xyz: np.ndarray, params: CropParams, base: np.ndarray | None = None,
@@ -44,8 +44,8 @@ def select_points(xyz: np.ndarray, params: CropParams, base: np.ndarray | None =
     return kept
 
 
-def crop_frame(frame: LidarFrame, params: CropParams, base: np.ndarray | None = None,
-               level: np.ndarray | None = None) -> tuple[np.ndarray, LidarFrame]:
+def crop_frame(frame: PointCloud, params: CropParams, base: np.ndarray | None = None,
+               level: np.ndarray | None = None) -> tuple[np.ndarray, PointCloud]:
     """Crop a frame; base and level are those of select_points.
 
     Returns:

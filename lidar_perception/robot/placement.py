@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidar_perception.robot.poses import invert_pose, transform_points
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 MIN_TILT_RAD = 1e-9  # smaller tilts are rounding errors
 
@@ -28,7 +28,7 @@ class Placement:
     level: np.ndarray | None = None
     out: np.ndarray | None = None
 
-    def level_frame(self, frame: LidarFrame) -> LidarFrame:
+    def level_frame(self, frame: PointCloud) -> PointCloud:
         """Return the cloud in the level frame; the cloud itself if it is level already."""
         return frame if self.level is None else replace(
             frame, xyz=transform_points(frame.xyz, self.level))

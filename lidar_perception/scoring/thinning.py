@@ -6,10 +6,10 @@ import zlib
 
 import numpy as np
 
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 
-def thinned(frame: LidarFrame, share: float, name: str) -> LidarFrame:
+def thinned(frame: PointCloud, share: float, name: str) -> PointCloud:
     """About this share (0..1) of the points of the frame called name, drawn at random but always
     the same; with 1 the frame itself. A smaller share keeps some of the points of a larger one."""
     if share >= 1.0:

@@ -13,7 +13,7 @@ from lidar_perception.simulation.raycast import Hits, cast
 from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.scene import ANY, SECONDS, Moment, Scene, Scenes, make_scene
 from lidar_perception.simulation.sensor import HDL64E, Sensor
-from lidar_perception.types import GroundTruth, InputError, LidarFrame
+from lidar_perception.types import GroundTruth, InputError, PointCloud
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 START_NS = 1_700_000_000 * 10**9
@@ -32,7 +32,7 @@ class SimulatedScan:
     of the drive's first scan.
     """
 
-    frame: LidarFrame
+    frame: PointCloud
     truth: GroundTruth
     semantic: np.ndarray
     instance: np.ndarray
@@ -77,7 +77,7 @@ def scan_at(seed: int, i: int, sensor: Sensor, scenes: Scenes = ANY) -> Simulate
     pose[:3, 3] -= first[:3, 3]
     pose[:3] = first[:3, :3].T @ pose[:3]
     return SimulatedScan(
-        LidarFrame(got.xyz, got.intensity, stamp, LIDAR_FRAME), truth(moment, hits, got.owner),
+        PointCloud(got.xyz, got.intensity, stamp, LIDAR_FRAME), truth(moment, hits, got.owner),
         _moving(moment, got.owner, got.semantic), got.owner.astype(np.uint16), got.ring, got.time,
         pose)
 

@@ -14,7 +14,7 @@ from lidar_perception.data.bag import Bag
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.testing.detections import objects_of
-from lidar_perception.types import CLASSES, GroundTruth, InputError, LidarFrame
+from lidar_perception.types import CLASSES, GroundTruth, InputError, PointCloud
 from lidar_perception.wire.codec import load_typestore
 from lidar_perception.wire.topics import LIDAR_FRAME
 
@@ -37,7 +37,7 @@ def recording(clouds: Iterable[Any], labels: Iterable[Any] | None = None, *,
         if cloud.ndim != 2 or cloud.shape[1] not in (3, 4):
             raise InputError(f"cloud {i} has shape {cloud.shape}; it must be (N, 3) or (N, 4)")
         intensity = cloud[:, 3].copy() if cloud.shape[1] == 4 else None
-        frames.append(Frame.of(str(i), LidarFrame(
+        frames.append(Frame.of(str(i), PointCloud(
             np.ascontiguousarray(cloud[:, :3]), intensity, start_ns + round(i * 1e9 / hz),
             frame_id), truth))
     return frames

@@ -23,7 +23,7 @@ from lidar_perception.training.augment import TrainingScene, enlarge_boxes
 from lidar_perception.training.cache import cache_path, load_or_make
 from lidar_perception.training.database import THING, Database
 from lidar_perception.training.pasting import find_points_in_box
-from lidar_perception.types import CLASSES, PEDESTRIAN, LidarFrame
+from lidar_perception.types import CLASSES, PEDESTRIAN, PointCloud
 
 # A thing resembles a standing person if
 MAX_WIDTH_M = 1.2                # its sides are at most this long,
@@ -118,7 +118,7 @@ def find_things(scene: TrainingScene, min_points: int,
         Boxes (K, 7) float64, along the axes and from the ground up, and the points (N, 4) of each.
     """
     xyz = np.ascontiguousarray(scene.points[:, :3])
-    ground = segment_ground(LidarFrame(xyz), replace(
+    ground = segment_ground(PointCloud(xyz), replace(
         EXPERT_GROUND, sensor_pose=SensorPoseParams(height=scene.height)))
     ids = cluster_obstacles(xyz, ground, EXPERT_CLUSTERING)
     low, high, sizes = find_extents(xyz, ids, int(ids.max(initial=0)))

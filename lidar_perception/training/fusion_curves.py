@@ -220,7 +220,7 @@ def _make_sampler(params: FusedDetectorParams,
 
     def sample_scan(i: int) -> tuple[int, Samples]:
         frame = scenes.frame(i)
-        proposals = detector.mounted_at(frame.sensor_height).propose(frame.load())
+        proposals = detector.with_sensor_height(frame.sensor_height).propose(frame.load())
         return i, collect_samples(frame, proposals, i)
     return sample_scan
 

@@ -27,7 +27,7 @@ from lidar_perception.simulation.scene import ANY, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.cache import cache_path, file_fingerprint, folder_size, load_or_make
-from lidar_perception.types import GroundTruth, InputError, LidarFrame
+from lidar_perception.types import GroundTruth, InputError, PointCloud
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class SimulatedScenes:
         return Frame.of(f"street {scene} frame {part}", scan, kitti_labels(truth, camera), camera,
                         sensor_height=self.sensor.height)
 
-    def scan(self, i: int) -> tuple[LidarFrame, GroundTruth]:
+    def scan(self, i: int) -> tuple[PointCloud, GroundTruth]:
         """Return scan i with all its objects, from the cache if possible."""
         return load_or_make(self.path(i), lambda: self._simulate(i), _read_scan, _scan_arrays,
                             self.cache_gb)
@@ -164,7 +164,7 @@ class SimulatedScenes:
         if self.cache is not None and folder_size(self.cache) < self.cache_gb * 1e9:
             self.scan(i)
 
-    def _simulate(self, i: int) -> tuple[LidarFrame, GroundTruth]:
+    def _simulate(self, i: int) -> tuple[PointCloud, GroundTruth]:
         scan = scan_at(*self.locate(i), self.sensor, self.scenes)
         return scan.frame, scan.truth
 
@@ -172,7 +172,7 @@ class SimulatedScenes:
 EXTRAS = ("track_id", "truncated", "occluded", "num_points", "visible")
 
 
-def _scan_arrays(scan: tuple[LidarFrame, GroundTruth]) -> dict[str, np.ndarray]:
+def _scan_arrays(scan: tuple[PointCloud, GroundTruth]) -> dict[str, np.ndarray]:
     frame, truth = scan
     assert frame.intensity is not None  # simulated scans always have it
     extras = {name: np.array([e[name] for e in truth.extras]) for name in EXTRAS}
@@ -180,8 +180,8 @@ def _scan_arrays(scan: tuple[LidarFrame, GroundTruth]) -> dict[str, np.ndarray]:
                 class_ids=truth.class_ids, **extras)
 
 
-def _read_scan(arrays: Any) -> tuple[LidarFrame, GroundTruth]:
+def _read_scan(arrays: Any) -> tuple[PointCloud, GroundTruth]:
     columns = [arrays[name].tolist() for name in EXTRAS]
     extras = [dict(zip(EXTRAS, row)) for row in zip(*columns)]
-    return (LidarFrame(arrays["xyz"], arrays["intensity"]),
+    return (PointCloud(arrays["xyz"], arrays["intensity"]),
             GroundTruth.of(arrays["boxes"], arrays["class_ids"], extras))

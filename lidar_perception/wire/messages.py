@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.camera import Calibration, Camera
-from lidar_perception.classes import CALLED
+from lidar_perception.classes import ID_BY_ALIAS
 from lidar_perception.groups import renumber_ids
 from lidar_perception.intensity import (
     INTENSITY_FIELDS,
@@ -24,7 +24,7 @@ from lidar_perception.types import (
     Detections,
     GroundTruth,
     InputError,
-    LidarFrame,
+    PointCloud,
     class_ids,
     usable_returns,
 )
@@ -37,9 +37,9 @@ MAX_ID = 2**31  # marker ids are int32
 FullScale = Callable[[np.ndarray, DTypeLike], float]  # see intensity.full_scale
 
 
-def to_frame(msg: Any, intensity_max: float | None = None,
-             scale: FullScale = infer_full_scale) -> tuple[LidarFrame, np.ndarray]:
-    """Convert a PointCloud2 to a LidarFrame of its usable points.
+def to_point_cloud(msg: Any, intensity_max: float | None = None,
+             scale: FullScale = infer_full_scale) -> tuple[PointCloud, np.ndarray]:
+    """Convert a PointCloud2 to a PointCloud of its usable points.
 
     If the cloud has a column `in_view`, points where it is 0 are left out.
 
@@ -71,7 +71,7 @@ def to_frame(msg: Any, intensity_max: float | None = None,
         indices = kept if indices is None else indices.take(kept)
         coordinates = coordinates.take(kept, axis=0)
         intensity = None if intensity is None else intensity.take(kept)
-    frame = LidarFrame(coordinates, intensity, to_ns(msg.header.stamp), msg.header.frame_id)
+    frame = PointCloud(coordinates, intensity, to_ns(msg.header.stamp), msg.header.frame_id)
     return frame, np.arange(len(points)) if indices is None else indices
 
 
@@ -103,12 +103,12 @@ def read_raw_intensity(msg: Any) -> tuple[np.ndarray, np.dtype] | None:
         raise InputError(str(error)) from None
 
 
-def diagnose_intensity(frame: LidarFrame) -> str | None:
+def diagnose_intensity(frame: PointCloud) -> str | None:
     """Return a message if the intensity scale of a frame is implausible, else None."""
     return find_scale_problem(frame.intensity)
 
 
-def diagnose_recorded_intensity(source: Any, clouds: Sequence[LidarFrame]) -> str | None:
+def diagnose_recorded_intensity(source: Any, clouds: Sequence[PointCloud]) -> str | None:
     """Return a message if the intensity scale of a recording is implausible, else None.
 
     Args:
@@ -258,12 +258,12 @@ def make_truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any
 
 def to_class_ids(names: Iterable[str]) -> list[int]:
     """Return the indices into CLASSES of class names of any software stack; Misc if unknown."""
-    return [CALLED.get(name.casefold(), CLASSES.index("Misc")) for name in names]
+    return [ID_BY_ALIAS.get(name.casefold(), CLASSES.index("Misc")) for name in names]
 
 
 def find_unknown_classes(names: Iterable[str]) -> list[str]:
     """Return the sorted names that to_class_ids does not know."""
-    return sorted({name for name in names if name.casefold() not in CALLED})
+    return sorted({name for name in names if name.casefold() not in ID_BY_ALIAS})
 
 
 def to_truth(objects: MarkedObjects) -> GroundTruth:

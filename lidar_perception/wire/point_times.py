@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidar_perception.robot.deskew import PoseLookup, deskew
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import InputError, PointCloud
 from msg_utils.point_cloud2 import CloudError, add_columns, to_array
 from msg_utils.stamps import SECOND, to_ns
 
@@ -91,7 +91,7 @@ def _unit_ns(span: float, is_integer: bool, low: float) -> int:
     return 1 if is_integer else 10**9  # a cloud shorter than SWEEP_S
 
 
-def deskew_points(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: PoseLookup
+def deskew_points(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseLookup
                   ) -> tuple[np.ndarray, np.ndarray, PointTimes] | None:
     """Move the points of a frame to where they are seen from the sensor's pose at the stamp.
 
@@ -119,7 +119,7 @@ def deskew_points(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: PoseL
     return timed, moved, times
 
 
-def deskew_frame(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: PoseLookup) -> LidarFrame:
+def deskew_frame(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseLookup) -> PointCloud:
     """Return the frame with its points moved to its stamp, see deskew_points.
 
     Points without a time stay where they are.

@@ -21,7 +21,7 @@ from lidar_perception.candidates.seeds import Seed, seed_from_points
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.data.open import open_recording
 from lidar_perception.groups import group_points
-from lidar_perception.types import PEDESTRIAN, InputError, LidarFrame
+from lidar_perception.types import PEDESTRIAN, InputError, PointCloud
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -82,7 +82,7 @@ def with_threshold(threshold):
 
 
 def test_stages_are_subsets_of_the_first_stage():
-    s = segment_cloud(LidarFrame(scene()))
+    s = segment_cloud(PointCloud(scene()))
     seed = make_truth_source(boxes_at(PEOPLE))(s)
     tall = select_by_height(s.boxes, seed.height, HeightParams())
     assert 3 < tall.sum() < len(s.boxes)
@@ -97,7 +97,7 @@ def test_stages_are_subsets_of_the_first_stage():
 
 
 def test_threshold_0_accepts_every_cluster_and_1_only_the_seed():
-    s = segment_cloud(LidarFrame(scene()))
+    s = segment_cloud(PointCloud(scene()))
     k = s.cluster_ids[np.argmin(np.linalg.norm(s.xyz - [7, 2, -1], axis=1))]
     own = seed_from_points(s.xyz[s.cluster_ids == k], s.boxes[k - 1])
     everything = refine_segmented(s, make_fixed_source(own), with_threshold(0.0))
@@ -109,7 +109,7 @@ def test_threshold_0_accepts_every_cluster_and_1_only_the_seed():
 
 
 def test_augmentation_changes_scores_from_15_to_30_metres_only():
-    s = segment_cloud(LidarFrame(scene()))
+    s = segment_cloud(PointCloud(scene()))
     found = refine_segmented(s, make_truth_source(boxes_at(PEOPLE)), with_threshold(0.0))
     np.testing.assert_array_equal(found.final.boxes, found.stage1.boxes)
     ranges = np.hypot(*found.final.boxes[:, :2].T)
@@ -118,7 +118,7 @@ def test_augmentation_changes_scores_from_15_to_30_metres_only():
 
 
 def test_the_threshold_applies_to_each_stages_own_scores():
-    s = segment_cloud(LidarFrame(scene()))
+    s = segment_cloud(PointCloud(scene()))
     seed = make_fixed_source(make_truth_source(boxes_at(PEOPLE))(s))
     everything = refine_segmented(s, seed, with_threshold(0.0))
     assert (everything.final.scores != everything.stage2.scores).any()
@@ -132,7 +132,7 @@ def test_the_threshold_applies_to_each_stages_own_scores():
 
 
 def test_people_are_found_and_other_objects_are_not():
-    _, found = find_candidates(LidarFrame(scene()), make_truth_source(boxes_at(PEOPLE)),
+    _, found = find_candidates(PointCloud(scene()), make_truth_source(boxes_at(PEOPLE)),
                                params=with_threshold(0.75))
     order = np.argsort(found.final.boxes[:, 0])
     np.testing.assert_allclose(found.final.boxes[order, :2], PEOPLE + [0.05, 0], atol=0.1)
@@ -171,7 +171,7 @@ def test_the_seeds_own_cluster_passes_every_stage():
 
 def test_candidates_keep_the_ids_of_a_foreign_clustering():
     """Ids may have gaps and be huge; the candidates are the same as for 1..K."""
-    frame = LidarFrame(scene())
+    frame = PointCloud(scene())
     s = segment_cloud(frame)
     k = len(s.boxes)
     source = make_fixed_source(seed_from_points(s.xyz[s.cluster_ids == 1], s.boxes[0]))

@@ -35,7 +35,7 @@ from lidar_perception.candidates.silhouette import (
 )
 from lidar_perception.data.open import open_recording
 from lidar_perception.param_fields import with_values
-from lidar_perception.types import PEDESTRIAN, LidarFrame
+from lidar_perception.types import PEDESTRIAN, PointCloud
 
 seeds = st.integers(0, 2**32 - 1)
 METRIC = with_values(PipelineParams(), {"stm.window": "metric", "stm.spread": True,
@@ -260,7 +260,7 @@ def test_stages_of_best_are_accepted_by_confidence():
     flat = np.column_stack([rng.uniform(2, 30, 6000), rng.uniform(-20, 20, 6000),
                             np.full(6000, FLOOR)]).astype(np.float32)
     params = with_values(BEST, {"view.enabled": False, "confidence.threshold": 0.0})
-    s = segment_cloud(LidarFrame(np.concatenate([xyz, flat])), params=params)
+    s = segment_cloud(PointCloud(np.concatenate([xyz, flat])), params=params)
     seed = seed_from_points(people[0] + np.float32([0, -6, 0]),
                             make_box(8.0)[0] + np.float32([0, -6, 0, 0, 0, 0, 0]))
     all_ = refine_segmented(s, lambda _: seed, params).final
@@ -275,9 +275,9 @@ def test_stages_of_best_are_accepted_by_confidence():
 def test_automatic_seed_is_the_likeliest_cluster_or_template():
     template = load_seed()
     params = with_values(BEST, {"view.enabled": False})
-    empty = segment_cloud(LidarFrame(np.zeros((0, 3), np.float32)), params=params)
+    empty = segment_cloud(PointCloud(np.zeros((0, 3), np.float32)), params=params)
     assert make_automatic_source(template, params)(empty) is template
-    one = segment_cloud(LidarFrame(np.concatenate([
+    one = segment_cloud(PointCloud(np.concatenate([
         board(9.0, 0.55), np.float32([[x, y, FLOOR] for x in np.arange(3, 20, 0.4)
                                       for y in np.arange(-8, 8, 0.4)])])), params=params)
     assert make_automatic_source(template, with_values(params, {"seed.min_confidence": 1.0}))(one) \

@@ -18,7 +18,7 @@ from lidar_perception.candidates.seed_sources import (
 from lidar_perception.candidates.seeds import seed_from_points
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.param_fields import with_values
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
 
@@ -31,7 +31,7 @@ def template():
                                  np.float32([[5, 0, -1.7]]), floor()],
                          ids=["empty", "one point", "one low point", "only ground"])
 def test_clouds_without_objects_give_empty_results(xyz):
-    s, found = find_candidates(LidarFrame(xyz.astype(np.float32)), template())
+    s, found = find_candidates(PointCloud(xyz.astype(np.float32)), template())
     assert isinstance(s, SegmentedCloud)
     assert s.indices.tolist() == list(range(len(xyz))) and s.xyz.shape == (len(xyz), 3)
     assert s.ground.shape == (len(xyz),) and s.ground.dtype == bool
@@ -45,9 +45,9 @@ def test_clouds_without_objects_give_empty_results(xyz):
 
 def test_a_cloud_without_a_seed_is_an_input_error():
     with pytest.raises(InputError, match="no Pedestrian"):
-        find_candidates(LidarFrame(scene()), make_truth_source(np.zeros((0, 7))))
+        find_candidates(PointCloud(scene()), make_truth_source(np.zeros((0, 7))))
     with pytest.raises(InputError, match="no clusters"):
-        find_candidates(LidarFrame(floor().astype(np.float32)), make_click_source(np.zeros(3)))
+        find_candidates(PointCloud(floor().astype(np.float32)), make_click_source(np.zeros(3)))
 
 
 WITH_VIEW = PipelineParams(view=ViewParams(enabled=True))
@@ -55,7 +55,7 @@ WITH_VIEW = PipelineParams(view=ViewParams(enabled=True))
 
 def test_error_of_a_view_without_a_camera_names_the_remedy():
     with pytest.raises(InputError, match=r"view\.enabled"):
-        find_candidates(LidarFrame(scene()), template(), params=WITH_VIEW)
+        find_candidates(PointCloud(scene()), template(), params=WITH_VIEW)
 
 
 def test_the_view_equals_the_pipeline_on_the_points_in_view():
@@ -66,13 +66,13 @@ def test_the_view_equals_the_pipeline_on_the_points_in_view():
     xyz = scene()
     inside = camera.in_view(xyz)
     assert 0 < inside.sum() < len(xyz)
-    cropped, found = find_candidates(LidarFrame(xyz), template(), camera, WITH_VIEW)
+    cropped, found = find_candidates(PointCloud(xyz), template(), camera, WITH_VIEW)
     np.testing.assert_array_equal(cropped.indices, np.flatnonzero(inside))
-    alone, expected = find_candidates(LidarFrame(xyz[inside]), template())
+    alone, expected = find_candidates(PointCloud(xyz[inside]), template())
     np.testing.assert_array_equal(cropped.xyz, alone.xyz)
     np.testing.assert_array_equal(cropped.cluster_ids, alone.cluster_ids)
     np.testing.assert_array_equal(found.final.boxes, expected.final.boxes)
-    empty, _ = find_candidates(LidarFrame(np.zeros((0, 3), np.float32)), template(), camera,
+    empty, _ = find_candidates(PointCloud(np.zeros((0, 3), np.float32)), template(), camera,
                                WITH_VIEW)
     assert empty.xyz.shape == (0, 3)
 
@@ -81,8 +81,8 @@ def test_the_view_equals_the_pipeline_on_the_points_in_view():
 def test_the_order_of_the_points_does_not_matter(seed):
     xyz = scene()
     order = np.random.default_rng(seed).permutation(len(xyz))
-    s, found = find_candidates(LidarFrame(xyz), template())
-    t, shuffled = find_candidates(LidarFrame(xyz[order]), template())
+    s, found = find_candidates(PointCloud(xyz), template())
+    t, shuffled = find_candidates(PointCloud(xyz[order]), template())
     np.testing.assert_array_equal(t.ground, s.ground[order])
     np.testing.assert_array_equal(t.cluster_ids > 0, s.cluster_ids[order] > 0)
     for name in ("stage1", "stage2", "final"):
@@ -94,7 +94,7 @@ def test_the_order_of_the_points_does_not_matter(seed):
 
 
 def test_ground_points_have_no_cluster_and_ids_match_boxes():
-    s = segment_cloud(LidarFrame(scene()))
+    s = segment_cloud(PointCloud(scene()))
     assert not (s.ground & (s.cluster_ids > 0)).any()
     assert np.unique(s.cluster_ids).tolist() == list(range(len(s.boxes) + 1))
 
@@ -106,5 +106,5 @@ def test_the_automatic_seed_falls_back_to_the_template(xyz, min_confidence):
     params = with_values(PipelineParams(), {"seed.min_confidence": min_confidence,
                                             "clustering.dbscan.min_samples": 3})
     given = seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0])
-    assert make_automatic_source(given, params)(segment_cloud(LidarFrame(xyz.astype(np.float32)),
+    assert make_automatic_source(given, params)(segment_cloud(PointCloud(xyz.astype(np.float32)),
                                                               params=params)) is given

@@ -19,7 +19,7 @@ from lidar_perception.candidates.silhouette import (
     from_pixels,
     to_pixels,
 )
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 SCANS = DATA / "kitti_object/training/velodyne_reduced"
 seeds = st.integers(0, 2**32 - 1)
@@ -90,7 +90,7 @@ def test_silhouettes_of_random_clusters_equal_the_plain_ones(seed):
 @needs_data
 def test_silhouettes_of_real_clusters_equal_the_plain_ones():
     raw = np.fromfile(sorted(SCANS.glob("*.bin"))[4], np.float32).reshape(-1, 4)
-    found = segment_cloud(LidarFrame(np.ascontiguousarray(raw[:, :3])))
+    found = segment_cloud(PointCloud(np.ascontiguousarray(raw[:, :3])))
     ids = range(1, found.cluster_ids.max() + 1)
     assert len(ids) > 20
     for points in (found.xyz[found.cluster_ids == k] for k in ids):

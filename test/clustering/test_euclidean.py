@@ -100,10 +100,10 @@ def test_lattice_clouds_equal_the_plain_implementation(data):
 def test_a_real_scan_equals_the_plain_implementation(threshold, data):
     from lidar_perception.ground.params import GroundParams
     from lidar_perception.ground.segment import segment_ground
-    from lidar_perception.types import LidarFrame
+    from lidar_perception.types import PointCloud
     path = next((data / "kitti_object").rglob("velodyne/*.bin"))
     points = np.fromfile(path, np.float32).reshape(-1, 4)
-    frame = LidarFrame(xyz=np.ascontiguousarray(points[:, :3]),
+    frame = PointCloud(xyz=np.ascontiguousarray(points[:, :3]),
                        intensity=np.ascontiguousarray(points[:, 3]))
     ground = segment_ground(frame, GroundParams(method="cloth"))
     xyz = frame.xyz[~ground][::3]

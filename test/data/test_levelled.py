@@ -13,8 +13,8 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.robot.poses import invert_pose, make_pose
 from lidar_perception.testing.clouds import cloud_message
-from lidar_perception.types import GroundTruth, LidarFrame
-from lidar_perception.wire.messages import to_frame
+from lidar_perception.types import GroundTruth, PointCloud
+from lidar_perception.wire.messages import to_point_cloud
 from lidar_perception.wire.topics import ODOMETRY
 
 ROLL, PITCH, AHEAD = 3.0, -8.0, 130.0  # degrees
@@ -53,7 +53,7 @@ def make_tilted_frames():
                          CAMERA.height)
     numbers = np.arange(len(xyz), dtype=np.uint16)
     for i in range(3):
-        yield Frame.of(str(i), LidarFrame.of(xyz, np.linspace(0, 1, len(xyz), dtype=np.float32),
+        yield Frame.of(str(i), PointCloud.of(xyz, np.linspace(0, 1, len(xyz), dtype=np.float32),
                                              (i + 1) * 10**8, "front"),
                        GroundTruth.of(box, [3]), camera, pose=lambda i=i: pose(i) @ rotation,
                        point_truth=lambda: PointTruth(numbers, numbers))
@@ -78,7 +78,7 @@ def test_bag_of_tilted_sensor_is_converted_to_level(tmp_path, monkeypatch):
 
 def test_level_sensor_at_another_height_is_rotated(tmp_path, monkeypatch):
     floor = np.random.default_rng(2).uniform([-20, -20, -0.61], [20, 20, -0.59], (3000, 3))
-    write_bag(tmp_path / "drive", [Frame.of(str(i), LidarFrame.of(floor, None, (i + 1) * 10**8,
+    write_bag(tmp_path / "drive", [Frame.of(str(i), PointCloud.of(floor, None, (i + 1) * 10**8,
                                                                   "front")) for i in range(3)])
     (tmp_path / "robot.yaml").write_text(
         "/**:\n  ros__parameters:\n    input: {ahead: 90.0}\n"
@@ -109,7 +109,7 @@ def test_clouds_of_a_bag_are_deskewed(moves, tmp_path, monkeypatch):
         world_to_sensor = invert_pose(base_at(stamps()[i]) @ ON_BASE)
         expected = WORLD @ world_to_sensor[:3, :3].T + world_to_sensor[:3, 3]
         np.testing.assert_allclose(frame.load().xyz, expected, atol=0.01)
-        blurred = to_frame(make_moving_cloud(stamps()[i]))[0].xyz
+        blurred = to_point_cloud(make_moving_cloud(stamps()[i]))[0].xyz
         assert np.abs(blurred - expected).max() > 0.4
     assert i == CLOUDS - 1
 

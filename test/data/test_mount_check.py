@@ -16,7 +16,7 @@ from lidar_perception.data.mount_check import (
 )
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import level_points
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 
 @pytest.mark.parametrize("height", [0.4, 1.73, 3.0])
@@ -33,15 +33,15 @@ def test_sensor_height_is_measured(height):
 @pytest.mark.parametrize("lean", [0, 3, 8, -20])
 def test_leaning_sensor_of_a_recording_is_reported(lean):
     pose = SensorPoseParams(pitch=np.radians(lean))
-    clouds = [LidarFrame.of(level_points(street(i)[0], pose)) for i in range(3)]
+    clouds = [PointCloud.of(level_points(street(i)[0], pose)) for i in range(3)]
     recording = Recording(Path("drive.bag"), "bag", [])
     problem = find_mount_problem(recording, clouds)
     assert (problem is not None) == (abs(lean) > 5)
     if problem is not None:
         assert f"by {abs(lean)} degrees" in problem and "drive.bag --robot" in problem
-    flipped = [LidarFrame(cloud.xyz * np.float32([1, -1, -1])) for cloud in clouds]
+    flipped = [PointCloud(cloud.xyz * np.float32([1, -1, -1])) for cloud in clouds]
     assert "upside down" in find_mount_problem(recording, flipped)
-    assert find_mount_problem(recording, [LidarFrame.of(np.zeros((0, 3)))]) is None
+    assert find_mount_problem(recording, [PointCloud.of(np.zeros((0, 3)))]) is None
     assert find_mount_problem(recording, []) is None
 
 

@@ -27,7 +27,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.raw_clouds import open_clouds
 from lidar_perception.data.semantickitti import write_scan
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.types import SENSOR_HEIGHT, InputError, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import header_message
@@ -225,13 +225,13 @@ def test_unusable_returns_are_dropped_from_all_columns(tmp_path):
         xyz[index] = value
     kept = np.setdiff1d(np.arange(len(xyz)), list(bad))
     before = xyz.copy(), intensity.copy()
-    frame = LidarFrame.of(xyz, intensity, 5, "velodyne")
+    frame = PointCloud.of(xyz, intensity, 5, "velodyne")
     assert np.array_equal(frame.xyz, xyz[kept].astype(np.float32))
     assert np.array_equal(frame.intensity, kept) and (frame.stamp_ns, frame.frame_id) == (
         5, "velodyne")
     assert frame.xyz.dtype == np.float32 and frame.xyz.flags.c_contiguous
     assert np.array_equal(before[0], xyz, equal_nan=True) and np.array_equal(before[1], intensity)
-    assert LidarFrame.of(xyz).intensity is None and len(LidarFrame.of(xyz[:0])) == 0
+    assert PointCloud.of(xyz).intensity is None and len(PointCloud.of(xyz[:0])) == 0
     unit = intensity / np.float32(len(xyz))
     write_scan(tmp_path / "sequences/00", 0, np.column_stack([xyz, unit]),
                np.arange(len(xyz)), np.arange(len(xyz)))

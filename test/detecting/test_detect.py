@@ -34,7 +34,7 @@ from lidar_perception.detecting.pictures import FrameDrawer
 from lidar_perception.detecting.results import FrameResult
 from lidar_perception.detecting.run import detect as run_detector
 from lidar_perception.detectors import open as opening
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.open import LOAD
 from lidar_perception.labels.exchange import import_labels
 from lidar_perception.scoring.recorded import by_stamp
@@ -338,7 +338,7 @@ def test_labels_and_cameras_that_cannot_be_read_are_not_needed(kitti, tmp_path, 
 
 
 def test_what_is_wrong_is_said_once_with_its_count(kitti, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(MadeDetector, "__call__", lambda self, frame: Found(
+    monkeypatch.setattr(MadeDetector, "__call__", lambda self, frame: DetectionResult(
         Detections.none(), problem=f"{np.ptp(frame.xyz)} m are not much"))
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out") == 0
     said = " ".join(capsys.readouterr().out.split())
@@ -346,7 +346,7 @@ def test_what_is_wrong_is_said_once_with_its_count(kitti, tmp_path, monkeypatch,
 
 
 def test_numbers_that_are_not_finite_are_not_written(kitti, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(MadeDetector, "__call__", lambda self, frame: Found(
+    monkeypatch.setattr(MadeDetector, "__call__", lambda self, frame: DetectionResult(
         Detections.of(np.full((1, 7), np.nan))))
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out", "--format", ALL) == 1
     assert "not finite" in capsys.readouterr().out

@@ -24,7 +24,7 @@ from lidar_perception.ground.segment import segment_ground
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.sensor import HDL64E
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import InputError, PointCloud
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -93,7 +93,7 @@ def test_nothing_behind_or_nothing_at_all_is_no_trouble(street):
     detector = shipped(range="around")
     ahead = detector(street.frame.take(np.flatnonzero(street.frame.xyz[:, 0] > 6)))
     assert len(ahead.detections) and ahead.problem is None
-    nothing = detector(LidarFrame.of(np.zeros((0, 3))))
+    nothing = detector(PointCloud.of(np.zeros((0, 3))))
     assert len(nothing.detections) == 0 and "empty" in nothing.problem
 
 

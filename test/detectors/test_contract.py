@@ -17,14 +17,14 @@ from lidar_perception.classes import CAR
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors import normalized_view
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
-from lidar_perception.detectors.contract import Found
-from lidar_perception.detectors.normalized_view import restore_detections, without_carrier
+from lidar_perception.detectors.contract import DetectionResult
+from lidar_perception.detectors.normalized_view import drop_ego_vehicle, restore_detections
 from lidar_perception.detectors.pointnet import weights_file as pointnet_weights
 from lidar_perception.detectors.pointpillars import weights_file as pointpillars_weights
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.scoring.comparison.contenders import contenders
-from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, InputError, LidarFrame
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, InputError, PointCloud
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 NAMES = ["STM-CPA paper", "STM-CPA best", "STM-CPA best, auto", "PointPillars v0 compact",
@@ -35,7 +35,7 @@ each_name = pytest.mark.parametrize("name", NAMES)
 @pytest.fixture(scope="module")
 def frame():
     cloud, truth = crowd(1)
-    return Frame.of("crowd", LidarFrame(cloud[:, :3].copy(), cloud[:, 3].copy()), truth,
+    return Frame.of("crowd", PointCloud(cloud[:, :3].copy(), cloud[:, 3].copy()), truth,
                     CALIBRATION)
 
 
@@ -93,12 +93,12 @@ def test_an_intensity_of_another_scale_is_said_and_read_in_0_to_1(detectors, fra
     scan, detector = frame.load(), detectors[name]
     assert scan.intensity.max() > 0.5
     raw = np.column_stack([scan.xyz, np.round(scan.intensity * full)])
-    found, expected = detector(raw), detector(LidarFrame.of(raw, intensity_max=full))
+    found, expected = detector(raw), detector(PointCloud.of(raw, intensity_max=full))
     assert same(found.detections, expected.detections)
     if name.startswith("STM-CPA") and "PointNet" not in name:  # which read no intensity
         assert found.problem == expected.problem
     else:
-        assert f"divided by {full}, a guess" in found.problem and "LidarFrame.of" in found.problem
+        assert f"divided by {full}, a guess" in found.problem and "PointCloud.of" in found.problem
         assert "a guess" not in (expected.problem or "")
 
 
@@ -109,7 +109,7 @@ def test_what_carries_the_sensor_is_no_detection_wherever_it_looks(seed):
     boxes = np.column_stack([rng.uniform(-4, 4, (50, 3)), rng.uniform(0.5, 5, (50, 3)),
                              rng.uniform(-4, 4, 50)])
     class_ids = np.arange(50) % len(CLASSES)
-    left = {tuple(box) for box in without_carrier(
+    left = {tuple(box) for box in drop_ego_vehicle(
         Detections.of(boxes, class_ids), SENSOR_HEIGHT).boxes.tolist()}
     angle = np.linspace(0, 2 * np.pi, 721)
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(721)])
@@ -141,7 +141,7 @@ def test_the_car_that_carries_the_sensor_is_left_out_and_the_next_one_stays(pose
 
 
 def test_every_network_leaves_out_what_carries_it(detectors, frame, monkeypatch):
-    monkeypatch.setattr(normalized_view, "without_carrier",
+    monkeypatch.setattr(normalized_view, "drop_ego_vehicle",
                         lambda detections, height: detections[:0])
     for name in NAMES:
         if name.startswith("P"):
@@ -153,7 +153,7 @@ def test_called_again_it_says_the_same_and_leaves_the_frame(detectors, frame, na
     scan = frame.load()
     before = scan.xyz.copy(), scan.intensity.copy()
     first, again = (detectors[name](scan) for _ in range(2))
-    assert isinstance(first, Found) and same(first, again)
+    assert isinstance(first, DetectionResult) and same(first, again)
     assert (first.problem, first.best) == (again.problem, again.best)
     assert first.timings.keys() == again.timings.keys()
     assert {CLASSES[i] for i in first.detections.class_ids} <= set(detectors[name].classes)

@@ -58,7 +58,7 @@ def test_class_gets_sensor_height_and_device(module):
     assert detector.classes == ("Pedestrian", "Car")
     found = detector(scene(0))
     assert found.detections.boxes[0, 5] == 0.5
-    higher = detector.mounted_at(2.0)
+    higher = detector.with_sensor_height(2.0)
     assert higher(scene(0)).detections.boxes[0, 5] == 2.0
     assert detector(scene(0)).detections.boxes[0, 5] == 0.5
     assert detector.build(0.5).device == "cpu" and detector.build(0.5) is detector.build(0.5)

@@ -23,7 +23,7 @@ from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import level_points, segment_ground
 from lidar_perception.param_fields import with_values
-from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
+from lidar_perception.types import CLASSES, Detections, InputError, PointCloud
 
 pytestmark = pytest.mark.usefixtures("one_thread", "carrier_too")
 each_version = pytest.mark.parametrize("version", VERSIONS)
@@ -111,7 +111,7 @@ def test_a_cluster_on_a_line_is_drawn_where_its_centre_is():
 
 def test_what_is_visible_does_not_depend_on_the_height_of_the_sensor():
     config, rng = tiny(), np.random.default_rng(0)
-    scan = LidarFrame(rng.uniform([-2, -7, -6], [12, 7, 5], (500, 3)).astype(np.float32))
+    scan = PointCloud(rng.uniform([-2, -7, -6], [12, 7, 5], (500, 3)).astype(np.float32))
     view = NormalizedView.of(scan, low=config.low, high=config.high)
     higher = replace(scan, xyz=scan.xyz - np.float32([0, 0, 0.5]))
     again = NormalizedView.of(higher, SensorPoseParams(height=2.23), config.low, config.high)
@@ -182,7 +182,7 @@ def test_intensity_is_scaled_and_may_be_left_out():
 @pytest.mark.parametrize("version", ["v0", "v4"])
 def test_a_cloud_with_nothing_to_see_has_no_detections_and_a_reason(version, xyz, words):
     detector = random_detector(version)
-    found = detector(LidarFrame(np.asarray(xyz, np.float32)))
+    found = detector(PointCloud(np.asarray(xyz, np.float32)))
     assert len(found.detections) == 0 and words in found.problem and found.timings["network"] == 0
     assert detector(frame()).problem is None
 
@@ -215,7 +215,7 @@ def test_many_points_and_broken_ones_are_no_trouble():
     xyz = np.tile(scan.xyz, (250, 1))
     xyz[:5] = [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [1e9, 0, 0], [-np.inf, 0, np.nan]]
     assert len(xyz) > 900_000
-    found = detector(LidarFrame(xyz, np.tile(scan.intensity, 250)), ground=np.zeros(len(xyz), bool),
+    found = detector(PointCloud(xyz, np.tile(scan.intensity, 250)), ground=np.zeros(len(xyz), bool),
                      cluster_ids=np.tile(np.arange(len(scan)), 250))
     assert found.problem is None
 

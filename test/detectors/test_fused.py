@@ -24,20 +24,20 @@ from lidar_perception.detectors.boxes import (
     on_ground,
     on_points,
 )
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.fused.detector import FusedDetector, remove_duplicates
 from lidar_perception.detectors.fused.evidence import LEAST, clipped_logit
 from lidar_perception.detectors.fused.fusion import KNOTS, package_models
 from lidar_perception.detectors.fused.model import probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
-from lidar_perception.detectors.normalized_view import without_carrier
+from lidar_perception.detectors.normalized_view import drop_ego_vehicle
 from lidar_perception.detectors.pointnet import classifier
 from lidar_perception.detectors.trained_network import Placement
 from lidar_perception.geometry import bev_iou, points_in_box, points_in_boxes, wrap_angle
 from lidar_perception.ground.surface import MIN_POINTS, fit_ground_heights
 from lidar_perception.param_fields import with_values
-from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, PointCloud
 
 # Others run these lines.
 pytestmark = [pytest.mark.no_cover,
@@ -201,7 +201,7 @@ def test_every_part_of_the_contract(detector):
     assert same(detector(scan), found)
     nothing = detector.with_min_score(1.0)(scan)
     assert len(nothing.detections) == 0 and set(nothing.best) == set(detector.classes)
-    empty = detector(LidarFrame(np.zeros((0, 3), np.float32), np.zeros(0, np.float32)))
+    empty = detector(PointCloud(np.zeros((0, 3), np.float32), np.zeros(0, np.float32)))
     assert len(empty.detections) == 0 and "no finite point" in empty.problem
     with pytest.raises(InputError, match="ground has 3 values"):
         detector(scan, ground=np.zeros(3, bool))
@@ -211,10 +211,10 @@ def test_a_higher_sensor_and_given_columns_change_nothing(detector):
     scan = frame()
     found = detector(scan).detections
     high = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
-    above = detector.mounted_at(1.73 + 0.5)(high).detections
+    above = detector.with_sensor_height(1.73 + 0.5)(high).detections
     above = replace(above, boxes=above.boxes + np.array([0, 0, 0.5, 0, 0, 0, 0], np.float32))
     # But for what would carry the one or the other sensor.
-    above, below = without_carrier(above, 1.73), without_carrier(found, 1.73 + 0.5)
+    above, below = drop_ego_vehicle(above, 1.73), drop_ego_vehicle(found, 1.73 + 0.5)
     assert len(below) > 90
     np.testing.assert_allclose(above.boxes, below.boxes, atol=2e-3)
     np.testing.assert_allclose(above.scores, below.scores, atol=2e-3)
@@ -229,7 +229,7 @@ def test_an_intensity_that_is_left_out_is_as_one_that_is_not_there(detector):
     scan, other = frame(), copy.copy(detector)
     other.params = with_values(detector.params, {"fused.intensity_scale": 0.0})
     pit = np.random.default_rng(0).uniform([4, -4, -2.81], [9, 4, -2.79], (3000, 3))
-    scan = LidarFrame(np.concatenate([scan.xyz, pit.astype(np.float32)]),
+    scan = PointCloud(np.concatenate([scan.xyz, pit.astype(np.float32)]),
                       np.concatenate([scan.intensity, np.full(3000, 0.5, np.float32)]))
     without = replace(scan, intensity=None)
     assert "no intensity" in detector(without).problem and other(without).problem is None
@@ -263,8 +263,8 @@ def test_a_car_close_to_a_sensor_that_it_does_not_carry_is_looked_at(detector, m
                                                                      stays):
     """What carries the sensor depends on how high that is, and not on how high networks have it."""
     car = Detections.of([[0, 1.4, -0.98, 4, 1.6, 1.5, 0]], CAR, 0.9)  # 0.6 m aside
-    monkeypatch.setattr(detector.proposer.__class__, "propose", lambda *_: Found(car))
-    assert len(detector.mounted_at(height).propose(frame()).detections) == stays
+    monkeypatch.setattr(detector.proposer.__class__, "propose", lambda *_: DetectionResult(car))
+    assert len(detector.with_sensor_height(height).propose(frame()).detections) == stays
 
 
 def test_it_says_so_when_a_part_had_to_leave_its_device(detector):

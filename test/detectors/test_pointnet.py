@@ -24,7 +24,7 @@ from lidar_perception.detectors.pointnet.config import ABLATIONS, NETWORKS, poin
 from lidar_perception.detectors.pointnet.network import Outputs, fused, make_pointnet, nearest
 from lidar_perception.detectors.pointnet.predict import found, outputs_of, predict
 from lidar_perception.geometry import wrap_angle
-from lidar_perception.types import SENSOR_HEIGHT, InputError, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SMALL = dict(points=24, centroids=8, coarse=4, neighbours=(3, 5, 6), coarse_neighbours=4,
@@ -57,7 +57,7 @@ def called(net, clusters, **changes):
 # what it reads
 
 def test_clusters_are_the_points_of_each_number_in_their_order(rng):
-    frame = LidarFrame(rng.normal(size=(50, 3)).astype(np.float32), rng.random(50, np.float32))
+    frame = PointCloud(rng.normal(size=(50, 3)).astype(np.float32), rng.random(50, np.float32))
     ids = rng.integers(-2, 6, 50)
     ids[ids == 4] = 5
     ids[:3] = 9, 9, 700
@@ -71,7 +71,7 @@ def test_clusters_are_the_points_of_each_number_in_their_order(rng):
     assert np.array_equal(some.points[some.first[1]:], clusters.points[:clusters.first[1]])
     none = clusters_of(frame, np.zeros(50, int))
     assert len(none) == 0 and len(network_input(none, 8).points) == 0
-    plain = clusters_of(LidarFrame(frame.xyz), ids, 2)
+    plain = clusters_of(PointCloud(frame.xyz), ids, 2)
     assert np.array_equal(plain.points[:, :3], clusters.points[:, :3])
     assert not plain.points[:, 3].any()
 

@@ -9,7 +9,7 @@ from pointnet_samples import eager, random_detector
 from lidar_perception.detectors.pointnet.clusters import ground_under
 from lidar_perception.detectors.pointnet.predict import CHUNK
 from lidar_perception.param_fields import with_values
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -20,15 +20,15 @@ def test_small_and_large_clusters_and_many_are_no_trouble():
     detector.classifier.compiled, batches = None, []
     network = detector.classifier.network
     network.register_forward_hook(lambda net, given, _: batches.append(len(given[0])))
-    one = LidarFrame(np.float32([[9, 0, -1]]), np.ones(1, np.float32))
+    one = PointCloud(np.float32([[9, 0, -1]]), np.ones(1, np.float32))
     assert len(detector(one, cluster_ids=np.ones(1, int)).detections) == 1
     xyz = rng.uniform([5, -3, -1.7], [9, 3, 2], (50_000, 3)).astype(np.float32)
-    big = LidarFrame(xyz, rng.uniform(0, 1, len(xyz)).astype(np.float32))
+    big = PointCloud(xyz, rng.uniform(0, 1, len(xyz)).astype(np.float32))
     assert len(detector(big, cluster_ids=np.ones(len(xyz), int)).detections) == 1
     spots = rng.uniform(-80, 80, (5000, 1, 3)) * [1, 1, 0.01]
     xyz = (spots + rng.normal(0, 0.2, (5000, 6, 3))).reshape(-1, 3).astype(np.float32)
     batches.clear()
-    found = detector(LidarFrame(xyz, np.zeros(len(xyz), np.float32)),
+    found = detector(PointCloud(xyz, np.zeros(len(xyz), np.float32)),
                      cluster_ids=np.repeat(np.arange(5000), 6) + 1)
     assert sum(batches) == 4000 and max(batches) <= CHUNK
     assert len(found.detections) == detector.params.pointnet.nms.max_boxes
@@ -40,7 +40,7 @@ def test_of_too_many_clusters_the_nearest_are_looked_at_and_the_others_counted()
     centres = np.column_stack([np.linspace(4, 60, 300), rng.uniform(-3, 3, 300), np.zeros(300)])
     rng.shuffle(centres)
     xyz = (np.repeat(centres, 6, axis=0) + rng.normal(0, 0.02, (1800, 3))).astype(np.float32)
-    frame = LidarFrame(xyz, np.full(1800, 0.5, np.float32))
+    frame = PointCloud(xyz, np.full(1800, 0.5, np.float32))
     ids, ground = np.repeat(np.arange(1, 301), 6), np.zeros(1800, bool)
 
     def detected(params, chosen=None):

@@ -13,7 +13,7 @@ from lidar_perception.detectors.pointnet.classifier import BOX_MARGIN_M
 from lidar_perception.detectors.pointnet.clusters import points_of
 from lidar_perception.detectors.pointnet.predict import predict
 from lidar_perception.geometry import points_in_box
-from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, LidarFrame
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, PointCloud
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -23,7 +23,7 @@ CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
 @pytest.fixture(scope="module")
 def frame():
     xyz = scene()
-    return LidarFrame(xyz, np.random.default_rng(1).uniform(0, 1, len(xyz)).astype(np.float32))
+    return PointCloud(xyz, np.random.default_rng(1).uniform(0, 1, len(xyz)).astype(np.float32))
 
 
 @pytest.fixture

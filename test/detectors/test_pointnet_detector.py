@@ -21,7 +21,7 @@ from lidar_perception.cli.main import cli
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.checkpoint import Header, network_of, read_header, save_checkpoint
 from lidar_perception.detectors.checkpoint import Header as PointPillarsHeader
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.normalized_view import to_sensor_frame
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet import weights_file as weights_module
@@ -34,7 +34,7 @@ from lidar_perception.detectors.pointpillars.network import load_network
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import level_points, segment_ground
 from lidar_perception.param_fields import with_values
-from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
+from lidar_perception.types import CLASSES, Detections, InputError, PointCloud
 
 pytestmark = pytest.mark.usefixtures("one_thread", "carrier_too")
 
@@ -57,9 +57,10 @@ def moved(found: Detections, turn: float = 0.0, shift=(0, 0, 0)) -> Detections:
     return replace(found, boxes=boxes)
 
 
-def alike(a: Detections | Found, b: Detections | Found, atol: float = 1e-4) -> bool:
+def alike(a: Detections | DetectionResult, b: Detections | DetectionResult,
+          atol: float = 1e-4) -> bool:
     """Whether both say the same; scores that hardly differ may have changed indices."""
-    a, b = (x.detections if isinstance(x, Found) else x for x in (a, b))
+    a, b = (x.detections if isinstance(x, DetectionResult) else x for x in (a, b))
     if len(a) != len(b):
         return False
     left = set(range(len(b)))
@@ -110,10 +111,10 @@ def test_clusters_do_not_know_of_each_other(ids):
 def test_a_frame_without_clusters_has_no_detections_and_a_reason(ids):
     detector, scan = random_detector(), frame()
     nothing = np.zeros(len(scan), np.int32)
-    far = LidarFrame(np.float32([[9, 0, -1], [20, 3, 0]]), np.zeros(2, np.float32))
+    far = PointCloud(np.float32([[9, 0, -1], [20, 3, 0]]), np.zeros(2, np.float32))
     for cloud, columns, words in (
-            (LidarFrame(np.zeros((0, 3), np.float32)), {}, "empty"),
-            (LidarFrame.of(np.full((5, 3), np.nan, np.float32)), {}, "no finite point"),
+            (PointCloud(np.zeros((0, 3), np.float32)), {}, "empty"),
+            (PointCloud.of(np.full((5, 3), np.nan, np.float32)), {}, "no finite point"),
             (scan, {"cluster_ids": nothing}, "no clusters"),
             (scan, {"cluster_ids": nothing - 1}, "no clusters"), (far, {}, "no clusters"),
             (scan, {"ground": np.ones(len(scan), bool)}, "no clusters"),

@@ -37,7 +37,7 @@ from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.types import CLASSES as KITTI_CLASSES
-from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, PointCloud
 
 SCANS = 6
 FEET = -1.7
@@ -69,11 +69,11 @@ def recorded(seed: int, points: int = 500) -> Frame:
     xyz = np.concatenate(parts).astype(np.float32)
     intensity = rng.beta(2, 4, len(xyz)).round(2).astype(np.float32)
     extras = [{"occluded": 0, "truncated": 0.0} for _ in boxes]
-    return Frame.of(str(seed), LidarFrame(xyz, intensity), GroundTruth.of(boxes, ids, extras),
+    return Frame.of(str(seed), PointCloud(xyz, intensity), GroundTruth.of(boxes, ids, extras),
                     CALIBRATION)
 
 
-def with_scan(frame: Frame, scan: LidarFrame) -> Frame:
+def with_scan(frame: Frame, scan: PointCloud) -> Frame:
     """The frame with other points."""
     return Frame.of(frame.name, scan, frame.truth(), frame.calibration())
 
@@ -176,7 +176,7 @@ def test_what_is_missing_on_the_simulated_side_is_wrong():
 
 
 def test_nothing_is_compared_with_nothing():
-    none = LidarFrame(np.zeros((0, 3), np.float32))
+    none = PointCloud(np.zeros((0, 3), np.float32))
     empty = Frame.of("0", none, GroundTruth.of([], []), CALIBRATION)
     for scans in ([], [empty], [Frame.of("0", none, None, CALIBRATION)]):
         measured = measured_scans(scans, PAPER)
@@ -239,7 +239,7 @@ def test_points_behind_a_face_of_a_car_are_so_far_behind_it(face, sensor, yaw):
     box = GroundTruth.of(np.array([[*centre, *size, yaw]]), [0])
 
     def found(points, truth=box):
-        scan = LidarFrame((centre + points @ turn.T).astype(np.float32), None)
+        scan = PointCloud((centre + points @ turn.T).astype(np.float32), None)
         return {name: row for name, row in object_rows(scan, truth, None).items()
                 if name.startswith("Car from")}
     assert set(found(own)) == {f"Car from {face}"}

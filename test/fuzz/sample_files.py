@@ -25,7 +25,7 @@ from lidar_perception.labels.drive_labels import DriveLabels, of_truth
 from lidar_perception.labels.exchange import export_labels
 from lidar_perception.runs.files import write_bytes, write_text
 from lidar_perception.simulation.camera import FORWARD_CAMERA
-from lidar_perception.types import PEDESTRIAN, GroundTruth, LidarFrame
+from lidar_perception.types import PEDESTRIAN, GroundTruth, PointCloud
 
 FRAMES = 2
 CAR = np.array([14.0, 5.0, -0.9, 4.2, 1.7, 1.5, 0.3])
@@ -55,7 +55,7 @@ def write_samples(root: Path) -> None:
     write_text(sequence / "poses.txt", format_pose(np.eye(4), FORWARD_CAMERA) * FRAMES)
     write_text(sequence / "times.txt", "0.0\n0.1")
     write_text(sequence / "calib.txt", format_calibration(FORWARD_CAMERA))
-    write_bag(root / "bag/drive", [Frame.of(str(i), LidarFrame(
+    write_bag(root / "bag/drive", [Frame.of(str(i), PointCloud(
         street(i), np.full(len(street(i)), 0.4, np.float32), STAMP + i * 10**8, "lidar"), TRUTH,
         FORWARD_CAMERA, pose=lambda: np.eye(4)) for i in range(FRAMES)])
     drive = open_recording(root / "bag/drive").frames

@@ -15,14 +15,14 @@ from lidar_perception.ground.params import (
     SensorPoseParams,
 )
 from lidar_perception.ground.segment import METHODS, level_points, segment_ground
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 pypatchworkpp = pytest.importorskip("pypatchworkpp")
 each_method = pytest.mark.parametrize("method", GROUND_METHODS)
 
 
 def segment(xyz, method, intensity=None, **params):
-    return segment_ground(LidarFrame(np.asarray(xyz, np.float32), intensity),
+    return segment_ground(PointCloud(np.asarray(xyz, np.float32), intensity),
                           GroundParams(method=method, **params))
 
 
@@ -128,7 +128,7 @@ def test_patchwork_equals_the_library_and_is_silent(capfd):
     assert (with_rnr != without).any()
     for mask in found:
         np.testing.assert_array_equal(mask, with_rnr)
-    no_intensity = LidarFrame(frame.xyz)
+    no_intensity = PointCloud(frame.xyz)
     np.testing.assert_array_equal(segment_ground(no_intensity, params), without)
     off = GroundParams(method="patchwork", patchwork=PatchworkParams(remove_reflections=False))
     np.testing.assert_array_equal(segment_ground(frame, off), without)

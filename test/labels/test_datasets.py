@@ -26,7 +26,7 @@ from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.simulation.sensor import generic
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.testing.clouds import cloud_message
-from lidar_perception.types import SENSOR_HEIGHT, Detections, GroundTruth, InputError, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, Detections, GroundTruth, InputError, PointCloud
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_detection_markers
 from lidar_perception.wire.topics import ODOMETRY, POINTS
@@ -120,7 +120,7 @@ def test_a_simulated_drive_comes_back_from_nuscenes_tables(simulated, tmp_path):
 
 
 def frames_at(seconds, **more):
-    return [Frame.of(str(i), LidarFrame.of(np.full((3, 3), 5.0 + i), None,
+    return [Frame.of(str(i), PointCloud.of(np.full((3, 3), 5.0 + i), None,
                                            1_700_000_000_000_000_000 + round(s * 1e9), "top"),
                      **more) for i, s in enumerate(seconds)]
 

@@ -14,7 +14,7 @@ from lidar_perception.rendering.colors import (
     get_class_color,
 )
 from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
-from lidar_perception.types import CLASSES, LidarFrame
+from lidar_perception.types import CLASSES, PointCloud
 
 CAR, PEDESTRIAN = CLASSES.index("Car"), CLASSES.index("Pedestrian")
 BOX = np.array([[12.0, 1.0, -1.0, 4.0, 1.8, 1.5, 0.3]])
@@ -27,10 +27,10 @@ each_stage = pytest.mark.parametrize("stage", STAGES.values(), ids=STAGES)
 def cloud(seed=0, count=2000):
     rng = np.random.default_rng(seed)
     xyz = rng.uniform([-30, -30, -1.8], [40, 30, 2], (count, 3)).astype(np.float32)
-    return LidarFrame(xyz, rng.uniform(0, 1, count).astype(np.float32))
+    return PointCloud(xyz, rng.uniform(0, 1, count).astype(np.float32))
 
 
-EMPTY = LidarFrame(np.zeros((0, 3), np.float32))
+EMPTY = PointCloud(np.zeros((0, 3), np.float32))
 
 
 def count_pixels(image, color, tolerance=3):
@@ -77,7 +77,7 @@ def test_order_of_points_and_boxes_does_not_matter(stage, seed):
 
 @each_stage
 def test_point_colour_is_height_or_intensity(stage):
-    scan = LidarFrame(np.array([[15.0, 0, 1.0]], np.float32), np.array([0.9], np.float32))
+    scan = PointCloud(np.array([[15.0, 0, 1.0]], np.float32), np.array([0.9], np.float32))
     for color, expected in (("height", color_by_height(np.array([2.73]))[0]), ("intensity", None)):
         made = Stage(stage.reach, stage.ahead, stage.ground, color, *SIZE)
         expected = made.colors(scan)[0] if expected is None else expected
@@ -98,7 +98,7 @@ def test_given_point_colours_are_not_modified():
 @pytest.mark.parametrize("far, reach", [(0.5, 6.0), (20.0, 20.0), (500.0, 55.0)])
 def test_stage_covers_range_of_first_cloud(far, reach):
     angles = np.linspace(0, 2 * np.pi, 200)
-    scan = LidarFrame(np.stack([far * np.cos(angles), far * np.sin(angles), 0 * angles],
+    scan = PointCloud(np.stack([far * np.cos(angles), far * np.sin(angles), 0 * angles],
                                axis=1).astype(np.float32))
     stage = Stage.of(scan, 1.0, True, size=SIZE)
     assert stage.reach == pytest.approx(reach, rel=1e-3) and stage.ground == -1.0

@@ -16,9 +16,9 @@ from lidar_perception.robot.crop import crop_frame, select_points
 from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placement import find_level_transform, make_tilted_pose
 from lidar_perception.robot.poses import invert_pose, transform_points
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import to_frame
+from lidar_perception.wire.messages import to_point_cloud
 from msg_utils.point_cloud2 import from_array
 
 BODY = (-1.0, -0.6, -1.7, 2.0, 0.6, 0.2)
@@ -91,14 +91,14 @@ def test_sectors_do_not_depend_on_the_mounting(roll, pitch, ahead):
 
 
 def test_a_disabled_crop_returns_the_same_frame():
-    frame = LidarFrame(make_points())
+    frame = PointCloud(make_points())
     indices, same = crop_frame(frame, CropParams())
     assert same is frame and indices.tolist() == list(range(len(frame)))
 
 
 def test_cropping_in_and_before_the_pipeline_is_the_same():
     """Indices refer to the given cloud, and a second crop removes nothing."""
-    frame = LidarFrame(np.ascontiguousarray(scene()[:, :3]))
+    frame = PointCloud(np.ascontiguousarray(scene()[:, :3]))
     params = with_values(PipelineParams(), {"crop.min_range": 4.0, "crop.sectors": (90.0, 270.0)})
     kept, before = crop_frame(frame, params.crop)
     assert 0 < len(kept) < len(frame)
@@ -114,7 +114,7 @@ def test_a_cropped_message_has_the_points_of_a_cropped_frame():
     for i, name in enumerate("xyz"):
         cloud[name] = make_points(300)[:, i]
     cloud["x"][::7] = np.nan
-    frame, usable = to_frame(from_array(cloud, header(bag_message), bag_message))
+    frame, usable = to_point_cloud(from_array(cloud, header(bag_message), bag_message))
     kept, _ = crop_frame(frame, CROP)
     finite = np.isfinite(cloud["x"])
     np.testing.assert_array_equal(usable.take(kept), np.flatnonzero(

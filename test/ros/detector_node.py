@@ -15,7 +15,7 @@ from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import to_detections, to_frame
+from lidar_perception.wire.messages import to_detections, to_point_cloud
 from msg_utils.markers import box_pose, from_marker_array, pose_yaw
 
 REMAP = {"~/input/points": "/in", "~/output/detections": "/found"}
@@ -55,7 +55,8 @@ class DetectorUnderTest:
         """What the detector finds without ROS."""
         detector = self.load(weights, "cpu", with_values(self.params, {
             f"{self.network}.threads": 1}))
-        return detector(to_frame(msg, self.params.input.intensity_max)[0], **columns).detections
+        cloud = to_point_cloud(msg, self.params.input.intensity_max)[0]
+        return detector(cloud, **columns).detections
 
 
 def small_v4(folder: Path) -> Path:

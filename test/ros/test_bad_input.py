@@ -12,7 +12,7 @@ from lidar_perception.scoring.centres.report import pedestrians
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.testing.detections import assert_detections
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import to_frame
+from lidar_perception.wire.messages import to_point_cloud
 from msg_utils.markers import from_marker_array
 from msg_utils.point_cloud2 import from_array, to_array
 from msg_utils.stamps import header_message, to_ns
@@ -29,7 +29,7 @@ def cloud(xyz, stamp=1, **changes):
 
 
 def xyz_of(msg):
-    return to_frame(msg)[0].xyz
+    return to_point_cloud(msg)[0].xyz
 
 
 def without_x():

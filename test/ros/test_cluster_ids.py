@@ -16,7 +16,7 @@ from lidar_perception.candidates.seeds import load_seed
 from lidar_perception.data.open import open_recording
 from lidar_perception.param_fields import with_values
 from lidar_perception.testing.clouds import cloud_message
-from lidar_perception.wire.messages import read_column, to_frame
+from lidar_perception.wire.messages import read_column, to_point_cloud
 from msg_utils.markers import from_marker_array
 
 FILE = {"view.enabled": False, "seed.source": "file"}
@@ -54,7 +54,7 @@ def test_boxes_and_candidates_have_the_ids_of_the_cloud(processes, peer, drive_b
     np.testing.assert_array_equal(np.float32(candidates.boxes), expected.final.boxes)
 
     marked, shown = out[-1], from_marker_array(boxes[-1])
-    xyz = to_frame(marked)[0].xyz
+    xyz = to_point_cloud(marked)[0].xyz
     ids = read_column(marked, "cluster_id", np.arange(len(xyz)))
     assert set(ids) - {0} == set(shown.ids) == {text["id"] for text in shown.extras}
     for number, box in zip(shown.ids, shown.boxes, strict=True):

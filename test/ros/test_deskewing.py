@@ -12,7 +12,7 @@ from test_robot_frames import PERIOD, START, give, message, mounted, odometry, p
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.robot.deskew import make_constant_motion, skew
 from lidar_perception.wire.codec import bag_message, decode, encode
-from lidar_perception.wire.messages import read_column, to_frame
+from lidar_perception.wire.messages import read_column, to_point_cloud
 from msg_utils.point_cloud2 import to_array
 from msg_utils.stamps import time_message
 
@@ -68,7 +68,7 @@ def test_a_cloud_of_a_moving_sensor_is_moved_to_its_stamp(start, source):
     assert np.median(wrong) > 0.5
     np.testing.assert_array_equal(moved[body], still[body])
     assert not read_column(after, "in_view", body).any() and not to_array(after)["t"].any()
-    frame_, _ = to_frame(after)
+    frame_, _ = to_point_cloud(after)
     again = start(GroundSegmentation, **{"input.deskew": source})
     again.transforms = node.transforms
     give(again, after)

@@ -23,7 +23,7 @@ from lidar_perception.scoring.centres.report import (
     seed_source,
 )
 from lidar_perception.testing.processes import NodesUnderTest
-from lidar_perception.wire.messages import read_column, to_detections, to_frame
+from lidar_perception.wire.messages import read_column, to_detections, to_point_cloud
 from lidar_perception.wire.topics import POINTS
 from msg_utils.markers import from_marker_array
 from msg_utils.point_cloud2 import to_array
@@ -93,12 +93,12 @@ def test_candidates_over_dds_are_those_of_the_offline_path(run, offline):
 def test_the_published_cloud_holds_all_fields_and_the_offline_columns(run, offline, drive_bag):
     single, _, out = run
     with Bag(drive_bag) as bag:
-        sent = {to_frame(m)[0].stamp_ns: m for _, _, m in bag.messages({POINTS})}
+        sent = {to_point_cloud(m)[0].stamp_ns: m for _, _, m in bag.messages({POINTS})}
     with Bag(out / "result") as bag:
         clouds = [m for _, _, m in bag.messages({cloud_topic(single)})]
     assert len(clouds) == len(sent)
     for msg in clouds:
-        frame, indices = to_frame(msg)
+        frame, indices = to_point_cloud(msg)
         original = to_array(sent[frame.stamp_ns])
         for name in original.dtype.names:
             np.testing.assert_array_equal(to_array(msg)[name], original[name])

@@ -26,7 +26,7 @@ from lidar_perception.detectors.pointnet.params import STEPS
 from lidar_perception.nodes.graph import POINTNET
 from lidar_perception.nodes.main import run
 from lidar_perception.param_fields import with_values
-from lidar_perception.wire.messages import read_column, to_frame
+from lidar_perception.wire.messages import read_column, to_point_cloud
 from lidar_perception.wire.topics import POINTS
 
 NODE = "pointnet_detector"
@@ -59,7 +59,7 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
     peer.wait_for_diagnostics(NODE, "waiting for input")
     peer.send(peer.talker(POINTS, CLOUD), message(1), lambda: points and received(found, 1),
               "detections")
-    scan = to_frame(message(1), 0.0)[0]
+    scan = to_point_cloud(message(1), 0.0)[0]
     segmented = segment_cloud(scan, None, with_values(PipelineParams(),
                                                       read_config(SHARED, PipelineParams())))
     assert segmented.ground.any() and segmented.cluster_ids.max() >= 5

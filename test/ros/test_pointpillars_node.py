@@ -24,7 +24,7 @@ from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.nodes.graph import POINTPILLARS
 from lidar_perception.nodes.main import run
 from lidar_perception.param_fields import with_values
-from lidar_perception.wire.messages import read_column, to_frame
+from lidar_perception.wire.messages import read_column, to_point_cloud
 from lidar_perception.wire.topics import POINTS
 
 NODE = "pointpillars_detector"
@@ -56,7 +56,7 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
               "detections")
 
     params = with_values(PipelineParams(), read_config(EXPERTS, PipelineParams()))
-    scan = to_frame(message(1), 0.0)[0]
+    scan = to_point_cloud(message(1), 0.0)[0]
     segmented = segment_cloud(scan, None, params)
     columns = {"ground": segmented.ground, "cluster_ids": segmented.cluster_ids}
     assert segmented.ground.any() and segmented.cluster_ids.max() >= 2

@@ -17,7 +17,7 @@ from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.transforms import STATIC_QOS
 from lidar_perception.param_fields import with_values
 from lidar_perception.wire.codec import bag_message, encode
-from lidar_perception.wire.messages import read_column, to_detections, to_frame
+from lidar_perception.wire.messages import read_column, to_detections, to_point_cloud
 from lidar_perception.wire.topics import POINTS
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import header_message
@@ -44,7 +44,7 @@ def test_a_cropped_cloud_over_dds_is_the_cropped_frame_offline(processes, peer, 
     clouds = peer.listen("/ground_segmentation/output/points", CLOUD)
     talker = peer.talker("/in", CLOUD)
     peer.send(talker, cloud, lambda: found and clouds, "both results")
-    frame, usable = to_frame(cloud)
+    frame, usable = to_point_cloud(cloud)
     segmented, candidates = find_candidates(frame, make_fixed_source(load_seed("")), params=params)
     expected, received = candidates.final, to_detections(from_marker_array(found[-1]))
     assert len(expected) and 0 < len(segmented.indices) < len(frame)

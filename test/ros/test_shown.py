@@ -23,7 +23,7 @@ from lidar_perception.ground.segment import segment_ground
 from lidar_perception.nodes import load_node_class
 from lidar_perception.nodes.external_node import create_context, shut_down_context
 from lidar_perception.nodes.graph import DETECTOR_NODES, SINGLE, build_graph
-from lidar_perception.wire.messages import to_frame
+from lidar_perception.wire.messages import to_point_cloud
 from lidar_perception.wire.topics import POINTS
 from msg_utils.point_cloud2 import to_array
 
@@ -152,7 +152,7 @@ def test_a_costmap_gets_the_obstacles_of_each_cloud(processes, peer, drive_bag):
     talker = peer.talker("/in", CLOUD)
     peer.wait(lambda: talker.get_subscription_count() == 2, "both nodes")
     peer.send(talker, cloud, lambda: all(heard.values()), "obstacles of both")
-    frame, indices = to_frame(cloud)
+    frame, indices = to_point_cloud(cloud)
     ground = segment_ground(frame)
     chosen = find_obstacles(frame.xyz, ground, ObstacleParams(0.2, 2.5))
     assert 0 < chosen.sum() < (~ground).sum()

@@ -18,7 +18,7 @@ from samples import crowd_folder, object_folder, walker_label, write
 from lidar_perception.cli.main import cli
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.pointnet import weights_file as pointnet_weights
 from lidar_perception.detectors.pointpillars import weights_file as pointpillars_weights
 from lidar_perception.scoring.comparison.contenders import contenders
@@ -77,7 +77,7 @@ def taken(root, *detectors) -> dict:
 
 def saying(say):
     """What gives a detector for each frame that says what say(frame) gives, Detections."""
-    return lambda frame: lambda scan: Found(say(frame))
+    return lambda frame: lambda scan: DetectionResult(say(frame))
 
 
 def right(frame, score=0.9) -> Detections:

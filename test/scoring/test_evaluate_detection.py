@@ -13,7 +13,7 @@ from samples import CALIBRATION, LABELS, object_folder, write
 from lidar_perception.data.kitti.results import read_results, write_results
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED
 from lidar_perception.scoring.kitti.report import INTERVALS
@@ -65,7 +65,7 @@ def detector(monkeypatch):
 
         def detect(frame):
             made.scans.append(frame)
-            return Found(made.find(frame))
+            return DetectionResult(made.find(frame))
         return detect
 
     monkeypatch.setattr("lidar_perception.detectors.open.open_detector", open_detector)

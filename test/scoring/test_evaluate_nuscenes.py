@@ -24,7 +24,7 @@ from lidar_perception.data.nuscenes.results import (
     write_results,
 )
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.scoring.nuscenes.report import OURS
@@ -56,7 +56,7 @@ def detector(monkeypatch):
 
     def opened(path, device, *, min_score, sensor_height, range, settings):
         made.asked.append((path, device, min_score, sensor_height))
-        return lambda scan: Found(made.find(scan))
+        return lambda scan: DetectionResult(made.find(scan))
     monkeypatch.setattr("lidar_perception.detectors.open.open_detector", opened)
     return made
 

@@ -36,7 +36,7 @@ from lidar_perception.types import (
     Detections,
     GroundTruth,
     InputError,
-    LidarFrame,
+    PointCloud,
 )
 
 seeds = st.integers(0, 2**32 - 1)
@@ -192,7 +192,7 @@ def scene_points():
 
 
 def frame(name, truth):
-    return Frame.of(name, LidarFrame(scene_points()), truth)
+    return Frame.of(name, PointCloud(scene_points()), truth)
 
 
 def cut():
@@ -258,7 +258,7 @@ def test_only_pedestrians_count():
 
 def test_labels_behind_the_camera_are_not_missed_in_its_view():
     cloud, truth = crowd(0)
-    scan, people = LidarFrame(cloud[:, :3], cloud[:, 3]), truth.of_class(PEDESTRIAN)
+    scan, people = PointCloud(cloud[:, :3], cloud[:, 3]), truth.of_class(PEDESTRIAN)
     ahead, behind, around = (
         Frame.of("a", scan, GroundTruth.of(own, [PEDESTRIAN] * len(own)), CALIBRATION)
         for own in (people, people * [-1, -1, 1, 1, 1, 1, 1],

@@ -37,7 +37,7 @@ from lidar_perception.scoring.points.segmentation import (
     true_ground,
 )
 from lidar_perception.scoring.points.tables import PUBLISHED
-from lidar_perception.types import CLASSES, SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, GroundTruth, InputError, PointCloud
 
 seeds = st.integers(0, 2**32 - 1)
 CAR, VAN, TRUCK = (CLASSES.index(name) for name in ("Car", "Van", "Truck"))
@@ -251,7 +251,7 @@ def test_low_vegetation_is_low_over_the_road_of_any_sensor(height):
     xyz = np.random.default_rng(0).uniform(-9, 9, (450, 3)).astype(np.float32)
     xyz[:, 2] = np.repeat([0.0, 0.4, 0.5], [400, 30, 20]) - height
     truth = PointTruth(np.repeat([40, 70], [400, 50]).astype(np.uint16), np.zeros(450, np.uint16))
-    frame = replace(Frame.of("a", LidarFrame(xyz), sensor_height=height), point_truth=lambda: truth)
+    frame = replace(Frame.of("a", PointCloud(xyz), sensor_height=height), point_truth=lambda: truth)
     result = by_methods(SegmentationParams(), ("cloth",), (), None)(frame)
     tp, fp, fn, tn = result.ground["cloth"][0]["with vegetation"]
     assert (tp + fn, fp + tn) == (430, 20)

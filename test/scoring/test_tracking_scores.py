@@ -11,7 +11,7 @@ from rich.console import Console
 
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.kitti.results import read_tracking_results, write_tracking_results
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.scoring.run import fill
 from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
 from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
@@ -20,7 +20,7 @@ from lidar_perception.scoring.tracking.pairs import Pairs, pairs_of, tracked_lab
 from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, observe
 from lidar_perception.scoring.tracking.tables import print_tracking_report
 from lidar_perception.simulation.camera import FORWARD_CAMERA
-from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError, LidarFrame
+from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError, PointCloud
 
 CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
 
@@ -125,9 +125,9 @@ def test_drives_that_share_a_bag_are_scored_as_if_they_had_names():
         frames, found = [], {}
         for k in range(2):
             for i, (truth, _) in enumerate(drive()):
-                scan = LidarFrame(np.ones((1, 3), np.float32), None, k * 10**10 + i * 10**8)
+                scan = PointCloud(np.ones((1, 3), np.float32), None, k * 10**10 + i * 10**8)
                 truth = GroundTruth.of(truth.boxes[::1 - 2 * k], truth.class_ids, truth.extras)
-                found[scan.stamp_ns] = Found(Detections.of(truth.boxes, CAR, 0.9))
+                found[scan.stamp_ns] = DetectionResult(Detections.of(truth.boxes, CAR, 0.9))
                 frames.append(Frame.of(f"{k}/{i}", scan, truth, sequence=str(k) * named,
                                        index=i if named else len(frames)))
         recording, report = Recording("a", "", frames), TrackingReport()
@@ -140,13 +140,13 @@ def test_drives_that_share_a_bag_are_scored_as_if_they_had_names():
 
 def test_frames_whose_pose_is_not_known_are_counted_and_said(capsys):
     poses = [np.eye(4), None, None]
-    frames = [Frame.of(f"a/{i}", LidarFrame(np.ones((1, 3), np.float32), None, 10**8 * (i + 1)),
+    frames = [Frame.of(f"a/{i}", PointCloud(np.ones((1, 3), np.float32), None, 10**8 * (i + 1)),
                        truth, sequence="a", index=i, pose=lambda i=i: poses[i])
               for i, (truth, _) in enumerate(drive(frames=3))]
     for ego, unknown in ("recording", 2), ("none", 0):
         report = TrackingReport()
         fill(report, Recording("a", "", frames), by_tracker(
-            lambda: lambda scan: Found(Detections.none()), ego=ego))
+            lambda: lambda scan: DetectionResult(Detections.none()), ego=ego))
         print_tracking_report({"ego": ego, **report.compute()}, Console(width=200))
         assert report.compute()["without_pose"] == unknown
         said = capsys.readouterr().out

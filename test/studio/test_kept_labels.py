@@ -18,7 +18,7 @@ from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import InputError, PointCloud
 from lidar_studio.drive import Drive, one_drive
 from lidar_studio.journal import Journal, header
 from lidar_studio.labelled import from_labels, joined, to_labels
@@ -31,7 +31,7 @@ BOX = [8.0, 3.0, -0.9, 0.8, 0.6, 1.7, 0.3]
 
 def frames(x=5.0):
     cloud = np.tile(np.array([[x, 0, -1]], np.float32), (50, 1))
-    return [replace(Frame.of(f"{i:06}", LidarFrame(cloud + np.float32(i), cloud[:, 0] * 0,
+    return [replace(Frame.of(f"{i:06}", PointCloud(cloud + np.float32(i), cloud[:, 0] * 0,
                                                    (i + 1) * 10**8, "velodyne")), index=i)
             for i in range(COUNT)]
 

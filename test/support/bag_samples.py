@@ -14,7 +14,7 @@ from samples import CALIBRATION, STAMP, scene, walker_truth
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.frame import Frame
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, TF_STATIC
 
 OTHER_CALIBRATION = Calibration(CALIBRATION.intrinsics * [[2], [2], [1]],
@@ -29,9 +29,9 @@ def scans(count: int = 3) -> list[Frame]:
                      CALIBRATION if i < 2 else OTHER_CALIBRATION) for i in range(count)]
 
 
-def cloud_frame(cloud: np.ndarray, stamp_ns: int) -> LidarFrame:
+def cloud_frame(cloud: np.ndarray, stamp_ns: int) -> PointCloud:
     """Return a frame of cloud (N, 4) [x y z intensity]."""
-    return LidarFrame(np.ascontiguousarray(cloud[:, :3]), cloud[:, 3].copy(), stamp_ns, "velodyne")
+    return PointCloud(np.ascontiguousarray(cloud[:, :3]), cloud[:, 3].copy(), stamp_ns, "velodyne")
 
 
 def message_bytes(path) -> list[tuple[str, int, bytes]]:

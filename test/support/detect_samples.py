@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from cli_samples import error_line, exit_of
 
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.param_fields import Params, param
 from lidar_perception.types import CLASSES, Detections
 
@@ -42,7 +42,7 @@ class MadeDetector:
     def with_min_score(self, min_score):
         return MadeDetector(replace(self.params, least=min_score), self.fails)
 
-    def mounted_at(self, height):
+    def with_sensor_height(self, height):
         return self
 
     def with_range(self, range):
@@ -56,7 +56,7 @@ class MadeDetector:
         found = Detections.of(boxes, [PEDESTRIAN, CAR], [STRONG, WEAK + abs(some) / 1e3])
         found = replace(found, sources={"a": np.array([0.5, np.nan], np.float32)})
         problem = f"{len(frame)} points are few" if frame.xyz[0, 0] > 0 else None
-        return Found(found[found.scores >= self.params.least], problem=problem)
+        return DetectionResult(found[found.scores >= self.params.least], problem=problem)
 
 
 def opened(path="", device="auto"):

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from lidar_perception.detectors.checkpoint import Header
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.pointpillars.config import NetworkConfig, network_config
 from lidar_perception.detectors.pointpillars.detector import CPU, PointPillarsDetector
 from lidar_perception.detectors.pointpillars.network import make_network
@@ -14,7 +14,7 @@ from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
 from lidar_perception.detectors.pointpillars.torch_network import Network, TorchNetwork
 from lidar_perception.param_fields import with_values
-from lidar_perception.types import Detections, LidarFrame
+from lidar_perception.types import Detections, PointCloud
 
 # A car across and a pedestrian, standing on the ground 1.73 m below [x y z l w h yaw].
 BOXES = torch.tensor([[6.0, 1.5, -0.95, 3.9, 1.7, 1.5, 1.2], [3.0, -2.5, -0.86, 0.8, 0.7, 1.7, -2]])
@@ -61,12 +61,12 @@ def lively(config, seed=0) -> torch.nn.Module:
     return network.requires_grad_(False)
 
 
-def frame(seed: int = 0) -> LidarFrame:
+def frame(seed: int = 0) -> PointCloud:
     """The two objects, and points behind and far away."""
     points = two_objects(seed)
     points = np.concatenate([points, points[::7] * [-1, 1, 1, 1], points[::9] + [50, 0, 0, 0]])
     points = points.astype(np.float32)
-    return LidarFrame(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
+    return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
 
 
 def eager(params: DetectorParams = DetectorParams(), score: float = 0.25,
@@ -89,9 +89,10 @@ def make_detector(network: Network, header: Header, params: DetectorParams = Det
     return PointPillarsDetector(PointPillarsProposer(network, header, device), params)
 
 
-def same(a: Detections | Found, b: Detections | Found, atol: float = 0.0) -> bool:
+def same(a: Detections | DetectionResult, b: Detections | DetectionResult,
+         atol: float = 0.0) -> bool:
     """Whether both say the same, in the same order."""
-    a, b = (x.detections if isinstance(x, Found) else x for x in (a, b))
+    a, b = (x.detections if isinstance(x, DetectionResult) else x for x in (a, b))
     return (len(a) == len(b) and np.array_equal(a.class_ids, b.class_ids)
             and np.allclose(a.boxes, b.boxes, rtol=0, atol=atol)
             and np.allclose(a.scores, b.scores, rtol=0, atol=atol))

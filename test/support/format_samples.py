@@ -10,7 +10,7 @@ from samples import INTRINSICS, LIDAR_TO_CAMERA
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 CALIBRATION = Calibration(INTRINSICS, LIDAR_TO_CAMERA, 1242, 375)
 DRIVES = {"one": ("0000",), "several": ("0003", "0011")}
@@ -43,7 +43,7 @@ def drive(name: str, frames: int = 3, camera: bool = True) -> list[Frame]:
         for i in range(5, 5 + frames):
             stamp = 1_700_000_000_000_000_000 + (100 * s + i) * 100_000_000
             xyz = rng.uniform(-20, 20, (50, 3)).astype(np.float32)
-            found.append(Frame.of(f"{sequence}/{i:06}", LidarFrame.of(xyz, None, stamp, "velodyne"),
+            found.append(Frame.of(f"{sequence}/{i:06}", PointCloud.of(xyz, None, stamp, "velodyne"),
                                   calibration=CALIBRATION if camera else None,
                                   pose=pose(i).copy, sequence=sequence, index=i))
     return found

@@ -16,7 +16,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.labels import format_label, to_labels
 from lidar_perception.data.kitti.write import write_object
-from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, LidarFrame
+from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, PointCloud
 from lidar_perception.wire.codec import bag_message
 from msg_utils.messages import ros_message
 from msg_utils.stamps import header_message
@@ -164,7 +164,7 @@ def lowered_crowd(seed: int, by: float) -> Frame:
     """The frame of a crowd as seen by a sensor so many metres lower; a tenth of a second a seed."""
     cloud, truth = crowd(seed)
     up = np.array([0, 0, by], np.float32)
-    scan = LidarFrame.of(cloud[:, :3] + up, cloud[:, 3].copy(), 10**9 + seed * 10**8, "velodyne")
+    scan = PointCloud.of(cloud[:, :3] + up, cloud[:, 3].copy(), 10**9 + seed * 10**8, "velodyne")
     return Frame.of(str(seed), scan, GroundTruth.of(truth.boxes + np.pad(up, (0, 4)),
                                                     truth.class_ids))
 

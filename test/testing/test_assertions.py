@@ -17,7 +17,11 @@ from lidar_perception.testing.detections import assert_detections, objects_of
 from lidar_perception.testing.launching import description, launch_file
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import make_detection_markers, make_truth_markers, to_frame
+from lidar_perception.wire.messages import (
+    make_detection_markers,
+    make_truth_markers,
+    to_point_cloud,
+)
 from msg_utils.detections import to_detection_array
 from msg_utils.point_cloud2 import to_array
 
@@ -55,8 +59,7 @@ def test_every_kind_of_detections_says_the_same(make):
 
 @pytest.mark.parametrize("limit", [{"max_distance": 0.5}, {"min_iou": 0.3}])
 def test_order_does_not_matter_and_what_was_taken_away_is_missing(limit):
-    """Found and expected are each other's mirror: what is missing of the one is extra of the
-    other."""
+    """Objects that are missing in one direction are extra in the other."""
     rng = np.random.default_rng(1)
     for _ in range(30):
         expected = some(rng, int(rng.integers(1, 20)))
@@ -107,7 +110,7 @@ def test_a_bag_gives_back_its_arrays(make_bag, storage):
     assert [p.suffix for p in path.iterdir() if p.name != "metadata.yaml"] == [
         {"mcap": ".mcap", "sqlite3": ".db3"}[storage]]
     with Bag(path) as bag:
-        clouds = [to_frame(m, 1.0)[0] for _, _, m in bag.messages({"/front"})]
+        clouds = [to_point_cloud(m, 1.0)[0] for _, _, m in bag.messages({"/front"})]
     assert [np.array_equal(c.xyz, scene(i)[:, :3]) for i, c in enumerate(clouds)] == [True] * 3
     assert np.array_equal(clouds[0].intensity, scene(0)[:, 3])
     assert np.diff([c.stamp_ns for c in clouds]).tolist() == [2 * 10**8] * 2

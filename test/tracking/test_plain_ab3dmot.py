@@ -52,8 +52,8 @@ def test_a_recording_with_track_ids_is_tracked_by_both_and_one_without_by_none(m
 
     from benchmark import tracking
     from lidar_perception.data.frame import Frame, Recording
-    from lidar_perception.types import LidarFrame
-    scans = [LidarFrame(one(10 + i).boxes[:, :3], None, 10**18 + i * 10**8) for i in range(6)]
+    from lidar_perception.types import PointCloud
+    scans = [PointCloud(one(10 + i).boxes[:, :3], None, 10**18 + i * 10**8) for i in range(6)]
     monkeypatch.setattr(tracking, "open_detector", lambda *_, **__: lambda scan: SimpleNamespace(
         detections=one(scan.xyz[0, 0])))
 

@@ -13,7 +13,7 @@ from samples import CALIBRATION
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import Header
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.config import pointnet_config
@@ -56,7 +56,7 @@ from lidar_perception.types import (
     Detections,
     GroundTruth,
     InputError,
-    LidarFrame,
+    PointCloud,
 )
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -242,7 +242,7 @@ def test_clusters_equal_those_of_detector_at_scene_height(rng):
     detector = PointNetDetector(classifier, with_values(
         PointNetDetectorParams(ground=CONFIG.ground, clustering=CONFIG.clustering),
         {"ground.sensor_pose.height": scene.height, "pointnet.min_points": 5}))
-    detector(LidarFrame(scene.points[:, :3].copy(), scene.points[:, 3].copy()))
+    detector(PointCloud(scene.points[:, :3].copy(), scene.points[:, 3].copy()))
     made = cut_clusters(scene, CONFIG, 5)
     assert sum(read) == (~made.loose).sum() > 3
 
@@ -277,7 +277,7 @@ def test_wrong_proposals_become_decoys_unless_they_touch_label(rng, tmp_path, mo
     near = BOXES[0] + [1, 0.5, 0, 0, 0, 0, 0.2]
     found = Detections.of(np.array([near, empty]), ids("Car", "Pedestrian"), np.array([0.9, 0.5]))
     monkeypatch.setattr(cut_scenes, "_load_proposer", lambda path: SimpleNamespace(
-        propose=lambda frame: Found(found)))
+        propose=lambda frame: DetectionResult(found)))
     plain, made = (cut_clusters(scene, CONFIG, 5, path) for path in (None, tmp_path))
     none = len(CONFIG.classes)
     boxes = made.boxes[made.loose & (made.labels == none)]
@@ -362,7 +362,7 @@ def test_validation_calibrates_and_names_broken_scenes(rng):
             return scene
 
         def frame(self, i):
-            return Frame.of("a", LidarFrame(np.zeros((0, 3), np.float32)), truth, CALIBRATION)
+            return Frame.of("a", PointCloud(np.zeros((0, 3), np.float32)), truth, CALIBRATION)
 
     items = [SceneReader((Source(),), load_validation_clusters)[n] for n in range(2)]
     assert items[1].sample is None and items[1].skipped == ("broken.bin",)

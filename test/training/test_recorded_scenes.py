@@ -23,7 +23,7 @@ from lidar_perception.training.data import Batches, Stream
 from lidar_perception.training.frames import draw_drives, draw_items, open_labelled_frames
 from lidar_perception.training.pointpillars.task import ScenePreparation
 from lidar_perception.training.scenes import RecordedScenes
-from lidar_perception.types import PEDESTRIAN, SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
+from lidar_perception.types import PEDESTRIAN, SENSOR_HEIGHT, GroundTruth, InputError, PointCloud
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -74,7 +74,7 @@ def test_bag_of_folder_has_same_scenes(tmp_path):
 
 
 def test_scenes_without_camera_are_labelled_all_around(tmp_path):
-    frames = [Frame.of("0", LidarFrame(two_objects()[:, :3].copy()), GroundTruth.of([WALKER],
+    frames = [Frame.of("0", PointCloud(two_objects()[:, :3].copy()), GroundTruth.of([WALKER],
                                                                                    [PEDESTRIAN]))]
     write_bag(tmp_path / "bag", frames)
     scene = open_labelled_frames(tmp_path / "bag").to_scenes().scene(0)
@@ -119,7 +119,7 @@ def test_one_frame_cannot_be_split():
 
 
 def test_labelled_end_of_drive_is_held_out(tmp_path):
-    frames = [Frame.of(str(i), replace(LidarFrame(two_objects()[:, :3].copy()), stamp_ns=i * 10**8),
+    frames = [Frame.of(str(i), replace(PointCloud(two_objects()[:, :3].copy()), stamp_ns=i * 10**8),
                        walker_truth() if i < 8 else None) for i in range(10)]
     write_bag(tmp_path / "bag", frames)
     training, held_out = open_labelled_frames(tmp_path / "bag").split(0.25, 0)
@@ -149,7 +149,7 @@ def low_bag(path: Path, height: float, count: int = 2) -> Path:
     person = rng.uniform(-0.25, 0.25, (300, 3)) * [1, 1, 3.4] + [8, 0.5, 0.85 - height]
     xyz = np.concatenate([ground, person]).astype(np.float32)
     truth = GroundTruth.of([[8, 0.5, 0.85 - height, 0.6, 0.6, 1.7, 0]], [PEDESTRIAN])
-    write_bag(path, [Frame.of(str(i), LidarFrame(xyz, np.full(len(xyz), 0.3, np.float32),
+    write_bag(path, [Frame.of(str(i), PointCloud(xyz, np.full(len(xyz), 0.3, np.float32),
                                                  i * 10**8), truth) for i in range(count)])
     return path
 

@@ -18,7 +18,7 @@ from detection_samples import BOXES, tiny, two_objects
 from samples import WALKER
 from training_toy import STILL, broken_folder, prepare_all
 
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.config import RANGES, network_config
 from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED, dense
@@ -200,8 +200,8 @@ def test_validation_scores_perfect_and_blind_detectors(tmp_path):
     root = broken_folder(tmp_path)
     scenes = SceneReader((open_labelled_frames(root).to_scenes(),),
                         partial(load_validation_frame, tiny()))
-    right = validate_detector(lambda frame: Found(Detections.of([WALKER])), scenes)
-    blind = validate_detector(lambda frame: Found(Detections.none()), scenes)
+    right = validate_detector(lambda frame: DetectionResult(Detections.of([WALKER])), scenes)
+    blind = validate_detector(lambda frame: DetectionResult(Detections.none()), scenes)
     assert right.compute()["frames"] == 3 and len(right.skipped) == 2
     names = ("Car", "Pedestrian", "Cyclist")
     for score in "bev", "map":

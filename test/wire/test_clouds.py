@@ -23,7 +23,7 @@ from lidar_perception.wire.clouds import (
 )
 from lidar_perception.wire.codec import MORE_TYPES, encode, load_typestore
 from lidar_perception.wire.livox import livox_ros1_to_cdr
-from lidar_perception.wire.messages import to_frame
+from lidar_perception.wire.messages import to_point_cloud
 from lidar_perception.wire.point_times import read_point_times
 from msg_utils.point_cloud2 import to_array
 from msg_utils.stamps import to_ns
@@ -56,7 +56,7 @@ def test_big_endian_livox_message_is_read():
 def test_livox_cloud_has_intensity_and_times():
     points = livox_points(7)
     cloud = decode_cloud(encode(livox_message(points)), LIVOX[1])
-    frame, indices = to_frame(cloud, 0.0)
+    frame, indices = to_point_cloud(cloud, 0.0)
     np.testing.assert_allclose(frame.intensity, points["reflectivity"] / 255, atol=1e-6)
     times = read_point_times(cloud, indices)
     np.testing.assert_allclose(times.seconds, points["offset_time"] * 1e-9, atol=1e-12)
@@ -121,7 +121,7 @@ def test_damaged_or_huge_compressed_cloud_is_reported(packing, monkeypatch):
             bytes(1001)):
         vars(message)["compressed_data"] = np.frombuffer(content, np.uint8)
         with pytest.raises(InputError, match=f"{packing}-compressed cloud is damaged|was cut"):
-            to_frame(decode_cloud(encode(message), COMPRESSED))
+            to_point_cloud(decode_cloud(encode(message), COMPRESSED))
 
 
 def test_compressed_copy_of_a_topic_is_left_out():

@@ -18,7 +18,7 @@ from lidar_perception.wire.messages import (
     make_extrinsics,
     read_camera,
     read_column,
-    to_frame,
+    to_point_cloud,
 )
 from lidar_perception.wire.topics import CAMERA_FRAME
 from msg_utils.messages import message_class, ros_message
@@ -126,7 +126,7 @@ def test_field_with_several_numbers_per_point_is_rejected(make, name):
     kind = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, "<u4", 2)]
     msg = from_array(np.ones(3, kind), header(make), make)
     with pytest.raises(InputError, match=f"'{name}' has count > 1"):
-        read_column(msg, name, to_frame(msg)[1])
+        read_column(msg, name, to_point_cloud(msg)[1])
 
 
 @pytest.mark.parametrize("kind, full", [("<f4", 1), ("<f4", 255), ("<f8", 65535), ("u1", 255),
@@ -136,15 +136,15 @@ def test_intensities_are_read_in_every_drivers_scale(kind, full):
     expected[0] = 1.0
     points = np.ones(len(expected), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", kind)])
     points["intensity"] = np.round(expected * full) if full > 1 else expected
-    read = to_frame(from_array(points, header(bag_message), bag_message), 0.0)[0]
+    read = to_point_cloud(from_array(points, header(bag_message), bag_message), 0.0)[0]
     np.testing.assert_allclose(read.intensity, expected, atol=0.5 / 255)
     assert read.intensity.dtype == np.float32 and diagnose_intensity(read) is None
     if np.dtype(kind).kind == "f":
         points["intensity"][1:4] = np.nan, np.inf, -np.inf
-        odd = to_frame(from_array(points, header(bag_message), bag_message), 0.0)[0].intensity
+        odd = to_point_cloud(from_array(points, header(bag_message), bag_message), 0.0)[0].intensity
         assert not odd[1:4].any() and np.array_equal(odd[4:], read.intensity[4:])
     points["intensity"] = points["intensity"] * 0.02  # a scale that no driver uses
-    dark = to_frame(from_array(points, header(bag_message), bag_message), float(full))[0]
+    dark = to_point_cloud(from_array(points, header(bag_message), bag_message), float(full))[0]
     assert "input.intensity_max" in diagnose_intensity(dark)
     assert "input.intensity_max" in diagnose_intensity(replace(dark, intensity=read.intensity * 2))
     assert diagnose_intensity(dark.take(np.arange(100))) is None

@@ -8,7 +8,7 @@ from samples import STAMP, header
 
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import to_frame
+from lidar_perception.wire.messages import to_point_cloud
 from lidar_perception.wire.point_times import read_point_times, replace_points
 from msg_utils.point_cloud2 import from_array, to_array
 
@@ -59,13 +59,13 @@ def test_replaced_points_have_the_time_of_the_stamp(driver):
     name, values = DRIVERS[driver]
     msg = cloud(name, values)
     chosen = np.arange(0, 1000, 3)
-    frame, _ = to_frame(msg)
+    frame, _ = to_point_cloud(msg)
     moved = frame.xyz[chosen] + np.float32([1, 2, 3])
     times = read_point_times(msg, chosen)
     after = replace_points(msg, bag_message, chosen, moved, times)
     assert [f.name for f in after.fields] == [f.name for f in msg.fields]
     assert (after.point_step, after.width) == (msg.point_step, msg.width)
-    np.testing.assert_array_equal(to_frame(after)[0].xyz[chosen], moved)
+    np.testing.assert_array_equal(to_point_cloud(after)[0].xyz[chosen], moved)
     others = np.setdiff1d(all_indices(msg), chosen)
     np.testing.assert_array_equal(to_array(after)[others][["x", "y", "z", "intensity"]],
                                   to_array(msg)[others][["x", "y", "z", "intensity"]])

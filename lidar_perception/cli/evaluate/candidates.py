@@ -72,7 +72,7 @@ def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> Non
     from lidar_perception.rendering.files import write_png
     from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
     from lidar_perception.scoring.centres.report import pedestrians_of, seed_source
-    from lidar_perception.types import LidarFrame
+    from lidar_perception.types import PointCloud
     best = report.with_most()
     if best is None:
         return
@@ -84,6 +84,6 @@ def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> Non
                                        params)
     stage = Stage.of(scan, params.ground.sensor_pose.height, params.view.enabled)
     write_png(png, draw_frame(
-        stage, LidarFrame(segmented.xyz), Boxes(found.final.boxes, found.final.class_ids), truth,
+        stage, PointCloud(segmented.xyz), Boxes(found.final.boxes, found.final.class_ids), truth,
         f"frame {frame.name}", colors=color_by_cluster(segmented.ground, segmented.cluster_ids)))
     console.print(f"picture: {png}")

@@ -16,7 +16,7 @@ from lidar_perception.data.kitti.labels import read_object_labels, read_tracking
 from lidar_perception.data.recorded_scale import make_scale_reader
 from lidar_perception.data.records import read_records
 from lidar_perception.runs.files import read_text
-from lidar_perception.types import GroundTruth, InputError, LidarFrame
+from lidar_perception.types import GroundTruth, InputError, PointCloud
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 START_NS = 1_316_995_200 * 10**9  # 26 September 2011, the first day of KITTI's recordings
@@ -31,9 +31,9 @@ def read_velodyne(path: Path) -> np.ndarray:
     return read_records(path, "x y z reflectance")
 
 
-def load_velodyne(path: Path, stamp_ns: int, scale: Callable[[], float]) -> LidarFrame:
+def load_velodyne(path: Path, stamp_ns: int, scale: Callable[[], float]) -> PointCloud:
     """Load the usable points of a .bin file; scale() returns the value of a full reflection."""
-    return LidarFrame.of(read_velodyne(path), None, stamp_ns, LIDAR_FRAME, scale())
+    return PointCloud.of(read_velodyne(path), None, stamp_ns, LIDAR_FRAME, scale())
 
 
 def make_velodyne_scale_reader(scans: Sequence[Path]) -> Callable[[], float]:

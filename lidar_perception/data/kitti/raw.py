@@ -30,7 +30,7 @@ from lidar_perception.data.kitti.folder import (
 )
 from lidar_perception.data.kitti.labels import read_tracklets
 from lidar_perception.runs.files import read_text
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 DATA = "velodyne_points/data"
@@ -110,7 +110,7 @@ def list_scans(drive: Path) -> list[Path]:
     return [file for _, file in sorted(files.items())]
 
 
-def load_scan(file: Path, stamp_ns: int, scale: Callable[[], float]) -> LidarFrame:
+def load_scan(file: Path, stamp_ns: int, scale: Callable[[], float]) -> PointCloud:
     """Load the usable points of a scan; scale() returns the intensity of a full reflection."""
     if file.suffix.lower() == ".bin":
         return load_velodyne(file, stamp_ns, scale)

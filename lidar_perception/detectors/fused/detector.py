@@ -15,7 +15,7 @@ from lidar_perception.classes import CAR
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.base import NetworkDetector, make_synthetic_frame
 from lidar_perception.detectors.boxes import cars_on_points, moved_towards, on_ground
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.fused.evidence import Evidence, clipped_logit, silhouette_at
 from lidar_perception.detectors.fused.fusion import Models, fusion_of, package_models
 from lidar_perception.detectors.fused.model import at_most, probabilities, sources
@@ -23,9 +23,9 @@ from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, 
 from lidar_perception.detectors.nms import keep_first, rotated_nms
 from lidar_perception.detectors.normalized_view import (
     NormalizedView,
+    drop_ego_vehicle,
     restore_detections,
     segment_view_ground,
-    without_carrier,
 )
 from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
@@ -38,7 +38,7 @@ from lidar_perception.detectors.pointpillars.proposer import PointPillarsPropose
 from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.geometry import bev_iou, centre_distances
 from lidar_perception.ground.surface import fit_ground_heights
-from lidar_perception.types import CLASSES, Detections, LidarFrame
+from lidar_perception.types import CLASSES, Detections, PointCloud
 
 
 class Proposals(NamedTuple):
@@ -98,16 +98,16 @@ class FusedDetector(NetworkDetector):
         """Return this detector: its scores are not calibrated any further."""
         return self
 
-    def detect(self, frame: LidarFrame, ground: np.ndarray | None,
-               cluster_ids: np.ndarray | None) -> Found:
+    def detect(self, frame: PointCloud, ground: np.ndarray | None,
+               cluster_ids: np.ndarray | None) -> DetectionResult:
         proposals = self.propose(frame, ground, cluster_ids, self.settings.scores)
         begin = perf_counter()
         detections, best = self.decide(proposals)
         detections = restore_detections(detections, self.params.ground.sensor_pose)
         timings = {**proposals.timings, STEPS[-1]: (perf_counter() - begin) * 1e3}
-        return Found(detections, timings, proposals.problem or self.fallback, best)
+        return DetectionResult(detections, timings, proposals.problem or self.fallback, best)
 
-    def propose(self, frame: LidarFrame, ground: np.ndarray | None = None,
+    def propose(self, frame: PointCloud, ground: np.ndarray | None = None,
                 cluster_ids: np.ndarray | None = None,
                 min_scores: ScoreParams = ScoreParams.all_alike(0.0)) -> Proposals:
         """Return the proposals for a cropped frame with the evidence of all sources.
@@ -137,7 +137,7 @@ class FusedDetector(NetworkDetector):
                 replace(settings.nms, max_boxes=settings.max_proposals), settings.cpu_fallback)
             people = clusters.result()[~is_ground]
         times.append(perf_counter())
-        proposed = without_carrier(found.detections, view.pose.height)
+        proposed = drop_ego_vehicle(found.detections, view.pose.height)
         evidence = {"network": clipped_logit(proposed.scores), "silhouette": clipped_logit(
             silhouette_at(proposed.boxes, obstacles.xyz, floor, people))}
         limits = at_most(self.models, proposed.class_ids, evidence, "classifier")

@@ -13,7 +13,7 @@ from lidar_perception.detectors.pointnet.compiled import CompiledPointNet
 from lidar_perception.detectors.pointnet.network import PointNet, fused
 from lidar_perception.detectors.pointnet.predict import Predictions, predict
 from lidar_perception.detectors.trained_network import TrainedNetwork
-from lidar_perception.types import CLASSES, Detections, LidarFrame
+from lidar_perception.types import CLASSES, Detections, PointCloud
 
 BOX_MARGIN_M = 0.2  # around a box: points in it are classified
 MIN_POINTS = 3      # in a box that is classified
@@ -44,7 +44,7 @@ class PointNetClassifier(TrainedNetwork):
 
         return self.run(work, cpu_fallback)
 
-    def classify(self, proposals: Detections, obstacles: LidarFrame, ground: np.ndarray,
+    def classify(self, proposals: Detections, obstacles: PointCloud, ground: np.ndarray,
                  selected: np.ndarray, cpu_fallback: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Judge boxes of a NormalizedView by the points in them.
 

@@ -14,7 +14,7 @@ from numba import njit
 
 from lidar_perception.geometry import counting_sort, points_in_boxes
 from lidar_perception.groups import group_by_id
-from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, PointCloud
 
 NEAR = (3.0, 6.0, 12.0)  # m: so far around a cluster the ground is looked for
 FEWEST = 3               # points of it
@@ -84,7 +84,7 @@ class ClusterInput:
     azimuths: np.ndarray
 
 
-def clusters_of(frame: LidarFrame, cluster_ids: np.ndarray, min_points: int = 1,
+def clusters_of(frame: PointCloud, cluster_ids: np.ndarray, min_points: int = 1,
                 ground: np.ndarray | None = None) -> Clusters:
     """The clusters of a frame of N points, with numbers (N,) int, 0 and below for none, that have
     enough points, by their numbers. Without an intensity it is 0. ground (N,) bool: the points
@@ -98,7 +98,7 @@ def clusters_of(frame: LidarFrame, cluster_ids: np.ndarray, min_points: int = 1,
     return found if ground is None else found.on(frame.xyz.compress(ground, axis=0))
 
 
-def points_of(boxes: np.ndarray, frame: LidarFrame, margin: float) -> Clusters:
+def points_of(boxes: np.ndarray, frame: PointCloud, margin: float) -> Clusters:
     """Return one cluster for each of boxes (K, 7), in their order: the points of a frame within the
     box, grown by margin metres. A point can be in several; a cluster can be without points."""
     indices, first = points_in_boxes(frame.xyz, boxes, margin)

@@ -14,7 +14,7 @@ from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.base import NetworkDetector, make_synthetic_frame
 from lidar_perception.detectors.boxes import cars_on_points
 from lidar_perception.detectors.calibration import calibrated
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.devices import chosen_device
 from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.detectors.normalized_view import (
@@ -28,7 +28,7 @@ from lidar_perception.detectors.pointnet.network import load_pointnet
 from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams, PointNetParams
 from lidar_perception.detectors.pointnet.predict import Predictions, found
 from lidar_perception.detectors.pointnet.weights_file import weights_file
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 
 class PointNetDetector(NetworkDetector):
@@ -56,8 +56,8 @@ class PointNetDetector(NetworkDetector):
         other.classifier = self.classifier.with_raw_scores()
         return other
 
-    def detect(self, frame: LidarFrame, ground: np.ndarray | None,
-               cluster_ids: np.ndarray | None) -> Found:
+    def detect(self, frame: PointCloud, ground: np.ndarray | None,
+               cluster_ids: np.ndarray | None) -> DetectionResult:
         t0 = perf_counter()
         settings = self.settings
         view = NormalizedView.of(frame, self.params.ground.sensor_pose,
@@ -86,7 +86,7 @@ class PointNetDetector(NetworkDetector):
         timings = {step: seconds * 1e3 for step, seconds in zip(
             STEPS, (t1 - t0 + t4 - t3, t2 - t1, t3 - t2, t5 - t4, t6 - t5))}
         problem = broken or self._find_problem(view, cluster_ids, clusters, dropped)
-        return Found(detections, timings, problem or self.fallback, best)
+        return DetectionResult(detections, timings, problem or self.fallback, best)
 
     def _detections(self, predicted: Predictions) -> tuple:
         """Return the detections, and what best_scores gives."""

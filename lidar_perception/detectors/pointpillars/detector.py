@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from lidar_perception.detectors.base import NetworkDetector, make_synthetic_frame
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.devices import CPU, chosen_device
 from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.detectors.normalized_view import NormalizedView, restore_detections
@@ -21,7 +21,7 @@ from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
 from lidar_perception.detectors.pointpillars.torch_network import Network, TorchNetwork
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import InputError, PointCloud
 
 
 class PointPillarsDetector(NetworkDetector):
@@ -43,14 +43,14 @@ class PointPillarsDetector(NetworkDetector):
     def settings(self) -> PointPillarsParams:
         return self.params.pointpillars
 
-    def detect(self, frame: LidarFrame, ground: np.ndarray | None,
-               cluster_ids: np.ndarray | None) -> Found:
+    def detect(self, frame: PointCloud, ground: np.ndarray | None,
+               cluster_ids: np.ndarray | None) -> DetectionResult:
         found = self.propose(frame, ground, cluster_ids)
         return replace(found, detections=restore_detections(found.detections,
                                                             self.params.ground.sensor_pose))
 
-    def propose(self, frame: LidarFrame, ground: np.ndarray | None = None,
-                cluster_ids: np.ndarray | None = None) -> Found:
+    def propose(self, frame: PointCloud, ground: np.ndarray | None = None,
+                cluster_ids: np.ndarray | None = None) -> DetectionResult:
         """Return what detect() returns, but in the coordinates of a NormalizedView and with the
         vehicle that carries the sensor."""
         t0 = perf_counter()

@@ -20,7 +20,7 @@ from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.groups import renumber_ids
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 MAP_KINDS = ("vehicle", "cyclist", "pedestrian")  # a channel each, however many classes there are
 # Into MAP_KINDS, by class, and last of what is of no class, which has no channel.
@@ -37,7 +37,7 @@ class NetworkInput:
     cluster_map: np.ndarray | None = None
 
 
-def network_input(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | None = None,
+def network_input(seen: PointCloud, config: NetworkConfig, ground: np.ndarray | None = None,
                   cluster_ids: np.ndarray | None = None,
                   ground_params: GroundParams = EXPERT_GROUND,
                   clustering: ClusteringParams = EXPERT_CLUSTERING) -> NetworkInput:
@@ -64,7 +64,7 @@ def network_input(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | 
                         if config.pseudo_map else None)
 
 
-def experts(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | None = None,
+def experts(seen: PointCloud, config: NetworkConfig, ground: np.ndarray | None = None,
             cluster_ids: np.ndarray | None = None, ground_params: GroundParams = EXPERT_GROUND,
             clustering: ClusteringParams = EXPERT_CLUSTERING,
             ) -> tuple[np.ndarray | None, np.ndarray | None]:

@@ -12,7 +12,7 @@ import torch
 
 from lidar_perception.detectors.calibration import calibrated
 from lidar_perception.detectors.checkpoint import Header
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.nms import apply_nms
 from lidar_perception.detectors.normalized_view import (
@@ -84,7 +84,7 @@ class PointPillarsProposer(TrainedNetwork):
 
     def propose(self, view: NormalizedView, ground: np.ndarray | None,
                 cluster_ids: np.ndarray | None, scores: ScoreParams, nms: NmsParams,
-                cpu_fallback: bool = True) -> Found:
+                cpu_fallback: bool = True) -> DetectionResult:
         """Return boxes for a view of M points, in the coordinates of the view.
 
         Args:
@@ -100,10 +100,10 @@ class PointPillarsProposer(TrainedNetwork):
         inputs = self._make_inputs(view, ground, cluster_ids)
         problem = self._find_problem(view, inputs)
         if not inputs:
-            return Found(Detections.none(), dict.fromkeys(TIMED_STEPS, 0.0),
+            return DetectionResult(Detections.none(), dict.fromkeys(TIMED_STEPS, 0.0),
                          problem or self.placement.fallback)
 
-        def work() -> tuple[list[float], Found]:
+        def work() -> tuple[list[float], DetectionResult]:
             times, predictions = self._predict(inputs)
             found = self._decode(predictions, self.raw_scores(scores.of_classes(self.classes)),
                                  nms)
@@ -150,7 +150,7 @@ class PointPillarsProposer(TrainedNetwork):
         return [begin, self.now()], dict(zip(inputs, predictions))
 
     def _decode(self, predictions: dict[bool, Prediction], min_scores: list[float],
-                nms: NmsParams) -> Found:
+                nms: NmsParams) -> DetectionResult:
         """Return the detections of all passes together."""
         passed = [self._select_boxes(half_turn, prediction, min_scores, nms.candidates)
                   for half_turn, prediction in predictions.items()]
@@ -168,7 +168,8 @@ class PointPillarsProposer(TrainedNetwork):
             best, problem = self.best_scores(torch.sigmoid(torch.cat(logits).amax(dim=0)).tolist())
         scores = torch.sigmoid(torch.from_numpy(best_logits)).numpy()
         detections = apply_nms(boxes, scores, labels, self.classes, nms)
-        return Found(calibrated(detections, self.header.calibration), problem=problem, best=best)
+        return DetectionResult(calibrated(detections, self.header.calibration), problem=problem,
+                               best=best)
 
     def _select_boxes(self, half_turn: bool, prediction: Prediction, min_scores: list[float],
                       max_boxes: int) -> Boxes:

@@ -24,7 +24,7 @@ from lidar_perception.scoring.points.segmentation import (
     objects_of_instances,
     score_clusters,
 )
-from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, PointCloud
 from lidar_perception.wire.params import ViewParams
 
 
@@ -76,7 +76,7 @@ def by_methods(params: SegmentationParams, grounds: tuple[str, ...], clusterings
                                                 objects_in_boxes(scan.xyz, truth)),
                                   whole=camera is None and params.view.enabled)
 
-    def clustered(scan: LidarFrame, ground: np.ndarray, objects: Objects) -> dict:
+    def clustered(scan: PointCloud, ground: np.ndarray, objects: Objects) -> dict:
         scores = {}
         for name in clusterings:
             ids, ms = timed(cluster_obstacles, scan.xyz, ground,
@@ -139,7 +139,7 @@ class SegmentationReport:
 
 
 def ground_of_methods(frame: Frame, params: SegmentationParams, grounds: tuple[str, ...]
-                      ) -> tuple[LidarFrame, PointTruth | None, dict[str, np.ndarray]]:
+                      ) -> tuple[PointCloud, PointTruth | None, dict[str, np.ndarray]]:
     """A frame, its labels, and the ground (N,) bool by each method, for a picture."""
     scan = frame.load()
     return scan, frame.point_truth(), {

@@ -10,7 +10,7 @@ from rich.console import Console
 from lidar_perception.scoring.pictures import save_picture
 from lidar_perception.scoring.points.segmentation import HIT_IOU, MIN_POINTS, PROTOCOLS, true_ground
 from lidar_perception.scoring.tables import counts, narrow_table, percent, print_skipped
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 # Patchwork++ on sequences 00 to 10 of SemanticKITTI, mean of the sequences, in percent: precision,
 # recall, F1. The first from the paper (IROS 2022, Table I), the second from its repository.
@@ -81,7 +81,7 @@ def _count(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def draw_ground(path: Path, name: str, frame: LidarFrame, semantic: np.ndarray,
+def draw_ground(path: Path, name: str, frame: PointCloud, semantic: np.ndarray,
                 found: dict[str, np.ndarray]) -> None:
     """Write a PNG: the scan from above, for each method what it found (N,) of the true ground.
     x (forward) points up, y (left) to the left, metres. Vegetation is left out of the count."""

@@ -10,7 +10,7 @@ import numpy as np
 from lidar_perception.geometry import elevation_angles
 from lidar_perception.intensity import INTENSITY_FIELDS, MAX_UNIT, infer_full_scale
 from lidar_perception.types import InputError
-from lidar_perception.wire.messages import to_frame
+from lidar_perception.wire.messages import to_point_cloud
 from lidar_perception.wire.point_times import NAMES as TIMES
 from lidar_perception.wire.point_times import read_point_times
 from msg_utils.point_cloud2 import to_array
@@ -64,7 +64,7 @@ def read_scan(msg: Any, name: str = "the cloud") -> Scan:
         InputError: It has too few usable points, or its coordinates cannot be metres.
     """
     try:
-        frame, indices = to_frame(msg)
+        frame, indices = to_point_cloud(msg)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
     if len(frame) < MIN_POINTS:

@@ -18,7 +18,7 @@ from lidar_perception.sensor_setup.measurement.measure import SensorMeasurement
 from lidar_perception.sensor_setup.measurement.scans import RETROREFLECTOR
 from lidar_perception.sensor_setup.report.params import choose_params
 from lidar_perception.simulation.sensor import sensor_named
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import PointCloud
 
 BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#999999"  # Okabe and Ito, 2008
 MAX_DRAWN_POINTS = 40_000
@@ -154,7 +154,7 @@ def _draw_scan(figure: Any, m: SensorMeasurement) -> bool:
     intensity = None if scan.intensity is None else (
         scan.intensity / params.input.intensity_max if params.input.intensity_max else
         scan.intensity).astype(np.float32)
-    frame = LidarFrame(scan.xyz.astype(np.float32), intensity)
+    frame = PointCloud(scan.xyz.astype(np.float32), intensity)
     _, frame = crop_frame(frame, params.crop)
     if m.mounting.mount is None:  # at an unknown height, furniture might count as ground
         ground = np.zeros(len(frame), bool)

@@ -26,7 +26,7 @@ from lidar_perception.scoring.points.clusters import UNKNOWN, labelled
 from lidar_perception.scoring.thinning import drawn
 from lidar_perception.training.augment import TrainingScene, raise_scene
 from lidar_perception.training.cache import cache_path, file_fingerprint, load_or_make
-from lidar_perception.types import CLASSES, SENSOR_HEIGHT, LidarFrame
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, PointCloud
 
 SPARSE_SHARES = 0.08, 0.7  # smallest and largest share of the points left in a sparse scene
 MIN_POINTS_LEFT = 3        # of a cluster in a sparse or augmented scene
@@ -130,7 +130,7 @@ def cut_clusters(scene: TrainingScene, config: PointNetConfig, min_points: int,
     """
     sensed = scene.points[:, :3]  # clustering uses the density that the sensor sees
     scene = raise_scene(scene, scene.height - SENSOR_HEIGHT)
-    frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
+    frame = PointCloud(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
     ground = segment_ground(frame, config.ground)
     clusters = clusters_of(frame, cluster_obstacles(frame.xyz, ground, config.clustering, sensed),
                            min_points, ground)
@@ -180,7 +180,7 @@ def make_decoys(background: Clusters, config: PointNetConfig) -> np.ndarray:
                             rng.uniform(-np.pi, np.pi, len(own))])
 
 
-def propose_boxes(frame: LidarFrame, proposer: Path) -> np.ndarray:
+def propose_boxes(frame: PointCloud, proposer: Path) -> np.ndarray:
     """Return the boxes (P, 7) that PointPillars proposes at any score.
 
     Args:

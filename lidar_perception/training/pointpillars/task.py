@@ -72,7 +72,7 @@ from lidar_perception.types import (
     Detections,
     GroundTruth,
     InputError,
-    LidarFrame,
+    PointCloud,
 )
 
 # Boxes of low score hardly change the AP, and validation is quicker without them.
@@ -140,7 +140,7 @@ class ScenePreparation:
         if self._objects is not None and rng.random() < self.augment.crowded:
             scene = paste_objects(scene, self._objects, self.augment, low, high, rng)
         scene = augment_scene(scene, self.augment, rng)
-        frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
+        frame = PointCloud(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
         seen = NormalizedView.of(frame, SensorPoseParams(height=scene.height), self.config.low,
                                  self.config.high).frame
         inputs = network_input(seen, self.config)
@@ -263,7 +263,7 @@ def detect_in_frame(frame: Frame, detector: Detector) -> Detected[Detections]:
     """Run a detector on a loaded frame, at the height of its sensor."""
     height = frame.sensor_height
     if height != SENSOR_HEIGHT:
-        detector = detector.mounted_at(height)
+        detector = detector.with_sensor_height(height)
     return detected(detector, frame, frame.truth(), frame.calibration())
 
 
