@@ -14,7 +14,7 @@ from typing import Any
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels, FrameLabels
-from lidar_perception.labels.formats.files import finite
+from lidar_perception.labels.formats.files import replace_non_finite
 from lidar_studio.state import ACCEPTED, KEY, Box, Kept, State, Track, track_to_json
 
 IMPORTED = "imported"  # source of a track
@@ -28,7 +28,7 @@ def from_labels(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[s
     for f, frame in enumerate(labels.frames):
         for k, name in enumerate(frame.class_names):
             number, score = int(frame.track_ids[k]), float(frame.scores[k])
-            said = {ID: number, REST: finite(frame.extra[k]),
+            said = {ID: number, REST: replace_non_finite(frame.extra[k]),
                     **({} if math.isnan(score) else {SCORE: score})}
             key = (number, name) if number != NO_TRACK else (NO_TRACK, f, k)
             if key in found and f in found[key][1]:  # an id twice in a frame: two tracks
@@ -37,9 +37,9 @@ def from_labels(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[s
             boxes[f], extra[f] = Box.of(frame.boxes[k], KEY), said
     tracks = [Track(number, name, ACCEPTED, 1.0, IMPORTED, boxes, frozenset(), extra)
               for number, (name, boxes, extra) in enumerate(found.values(), first_id)]
-    notes = {str(f): finite(frame.notes)
+    notes = {str(f): replace_non_finite(frame.notes)
              for f, frame in enumerate(labels.frames) if frame.notes}
-    return tracks, {"notes": notes, "extra": finite(labels.extra)}
+    return tracks, {"notes": notes, "extra": replace_non_finite(labels.extra)}
 
 
 def digest_of(tracks: Sequence[Track], kept: Kept) -> str:

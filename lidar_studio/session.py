@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.detectors.open import DetectorChoice
-from lidar_perception.labels.exchange import export_labels, import_labels, recognised
+from lidar_perception.labels.exchange import export_labels, import_labels, recognise_format
 from lidar_perception.runs.files import shorten_error
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 from lidar_studio import survey_cache
@@ -224,7 +224,7 @@ class Session:
         path, named = action.get("path"), action.get("format") or ""
         if not isinstance(path, str) or not isinstance(named, str):
             raise InputError("an import needs the path of labels, and may name their format")
-        labels = import_labels(Path(path), named or recognised(Path(path)), self.drive.frames)
+        labels = import_labels(Path(path), named or recognise_format(Path(path)), self.drive.frames)
         tracks, kept = from_labels(labels, self.state.next_id)
         before = self.state.kept
         digest, done = digest_of(tracks, kept), before.get("imports", [])

@@ -179,7 +179,7 @@ def _dataset(source: Path, recording: Any, seen: Callable[[Any], Any], format: s
     labels = None if detections is None else _on_topic(source, recording, detections)
     count = min(len(recording), limit or len(recording))
     if labels is not None and format == MCAP:
-        export_labels(labels.first(count), format, out, recording.frames[:count], force)
+        export_labels(labels.take_first(count), format, out, recording.frames[:count], force)
         console.print(f"{out}: {count} scans")
         return
     frames = show_progress(map(seen, islice(recording, count)), f"converting {source}", count)
@@ -192,16 +192,16 @@ def _dataset(source: Path, recording: Any, seen: Callable[[Any], Any], format: s
 
 def _labels(source: Path, recording: Any, format: str, out: Path, given: str | None,
             elsewhere: bool, detections: str | None, limit: int | None, force: bool) -> None:
-    from lidar_perception.labels.drive_labels import DriveLabels, of_truth
-    from lidar_perception.labels.exchange import export_labels, import_labels, recognised
+    from lidar_perception.labels.drive_labels import DriveLabels, read_frame_labels
+    from lidar_perception.labels.exchange import export_labels, import_labels, recognise_format
     count = min(len(recording), limit or len(recording))
     if detections is not None:
         labels = _on_topic(source, recording, detections)
     elif elsewhere:
-        labels = import_labels(source, given or recognised(source), recording.frames)
+        labels = import_labels(source, given or recognise_format(source), recording.frames)
     else:
-        labels = DriveLabels(list(map(of_truth, recording.frames[:])))
-    written = export_labels(labels.first(count), format, out, recording.frames[:count], force)
+        labels = DriveLabels(list(map(read_frame_labels, recording.frames[:])))
+    written = export_labels(labels.take_first(count), format, out, recording.frames[:count], force)
     console.print(f"{out}: {written.boxes} boxes of {written.frames} frames, "
                   f"as {format}")
     for what in written.left_out:

@@ -1,1 +1,1 @@
-"""Labels of drives: one type, and the formats of other tools and data sets in and out."""
+"""Labels of drives, and their conversion from and to the formats of other tools and data sets."""

@@ -1,4 +1,4 @@
-"""Labels in and out: which format lies there, and one way to read and to write each."""
+"""Import and export of labels: recognition of the format, and one reader and writer per format."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ from lidar_perception.labels.formats import (
     openpcdet,
     sustech,
 )
-from lidar_perception.labels.formats.files import MAX_BYTES, in_file, read_json
-from lidar_perception.labels.formats.kitti_lines import label_folder
-from lidar_perception.labels.names import format_name
+from lidar_perception.labels.formats.files import MAX_BYTES, read_json, report_format_errors
+from lidar_perception.labels.formats.kitti_lines import find_label_folder
+from lidar_perception.labels.names import resolve_format
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
 Read = Callable[[Path, Sequence[Frame]], DriveLabels]
 Write = Callable[..., None]  # labels, out, frames, force
 
-# Each reads the labels of a drive's frames at a path, and writes them to one, with force over what
-# is there. A new format is a file and a line here.
+# Reader and writer of each format; with `force`, a writer replaces existing files. A new format is
+# one file and one line here.
 FORMATS: dict[str, tuple[Read, Write]] = {
     "kitti": (kitti_object.read, kitti_object.write),
     "kitti-tracking": (kitti_tracking.read, kitti_tracking.write),
-    "nuscenes-detection": nuscenes.detection,
-    "nuscenes-tracking": nuscenes.tracking,
-    "labelcloud": labelcloud.absolute,
-    "labelcloud-rel": labelcloud.relative,
-    "labelcloud-vertices": labelcloud.vertices,
+    "nuscenes-detection": nuscenes.detection_format,
+    "nuscenes-tracking": nuscenes.tracking_format,
+    "labelcloud": labelcloud.absolute_format,
+    "labelcloud-rel": labelcloud.relative_format,
+    "labelcloud-vertices": labelcloud.vertices_format,
     "sustech": (sustech.read, sustech.write),
     "openlabel": (openlabel.read, openlabel.write),
     "mcap": (bag.read, bag.write),
     "mcap-labels": (bag.read, bag.write_labels),
 }
-# What can be read: these, and formats that are not written.
+# Readers of these formats and of those that are only read.
 READERS: dict[str, Read] = {name: read for name, (read, _) in FORMATS.items()} | {
     "kitti-raw": kitti_raw.read,
     "openpcdet": openpcdet.read,
@@ -58,9 +58,13 @@ WITH_NOTES = {"kitti", "kitti-tracking", "openlabel", "mcap", "mcap-labels"}
 
 
 @dataclass(frozen=True)
-class Written:
-    """What was written where: how many boxes of how many frames; and what was left out, as the
-    format has no place for it, in words."""
+class ExportResult:
+    """Result of an export.
+
+    Attributes:
+        boxes, frames: number of exported boxes and frames.
+        left_out: what the format cannot store, as text.
+    """
 
     path: Path
     boxes: int
@@ -69,70 +73,77 @@ class Written:
 
 
 def import_labels(path: Path, format: str, frames: Sequence[Frame]) -> DriveLabels:
-    """The labels at a path, of each of the frames of a drive in their order. InputError in one line
-    where they cannot be read, or are of frames that the drive has not."""
-    with np.errstate(all="ignore"):  # what is too large for a float is no label, see FrameLabels.of
-        read = READERS[format_name(format, READERS)]
-        return read(path, frames[:])  # of a bag, frames that do not hold their clouds
+    """Read the labels at a path for each frame of a drive, in order.
+
+    Raises InputError if they cannot be read, or belong to frames that the drive does not have.
+    """
+    with np.errstate(all="ignore"):  # FrameLabels.of rejects numbers that overflow
+        read = READERS[resolve_format(format, READERS)]
+        return read(path, frames[:])  # the slice of a bag has frames that do not hold their clouds
 
 
 def export_labels(labels: DriveLabels, format: str, out: Path, frames: Sequence[Frame],
-                  force: bool = False) -> Written:
-    """Write the labels of the frames of a drive. InputError in one line where they cannot be
-    written; then nothing is half-written. What exists is replaced with force only."""
-    format = format_name(format, FORMATS)
+                  force: bool = False) -> ExportResult:
+    """Write the labels of the frames of a drive; existing files are replaced only with `force`.
+
+    Raises InputError if they cannot be written; nothing is then partly written.
+    """
+    format = resolve_format(format, FORMATS)
     if len(labels) != len(frames):
-        raise InputError(f"labels of {len(labels)} frames for a drive of {len(frames)}; give those "
-                         "of the same frames")
-    in_file("what the labels keep of the file that they were read from",
-            lambda: FORMATS[format][1](labels, out, frames[:], force))
+        raise InputError(f"there are labels of {len(labels)} frames for a drive of {len(frames)}; "
+                         "give labels of the same frames")
+    report_format_errors("a field that the labels keep from the file they were read from",
+                         lambda: FORMATS[format][1](labels, out, frames[:], force))
     notes = 0 if format in WITH_NOTES else sum(len(each.notes) for each in labels.frames)
     ids = format == "kitti" and any((f.track_ids != NO_TRACK).any() for f in labels.frames)
-    return Written(out, labels.boxes, len(labels), (
+    return ExportResult(out, labels.box_count, len(labels), (
         *((f"{notes} regions without a box",) if notes else ()), *(("track ids",) if ids else ())))
 
 
-def recognised(path: Path) -> str:
-    """The format of the labels at a path. InputError if it is none of them, or cannot be told."""
+def recognise_format(path: Path) -> str:
+    """Return the format of the labels at a path. Raises InputError if it cannot be recognised."""
     files = [path] if path.is_file() else sorted(
         file for file in path.rglob("*") if file.suffix in (".txt", ".json")
         and not file.name.startswith(("_", ".")))
     if not path.exists():
-        raise InputError(f"there is no file or folder {path}; give one with labels: "
-                         f"{', '.join(READERS)}")
+        raise InputError(f"{path} does not exist; give a file or folder with labels in one of the "
+                         f"formats {', '.join(READERS)}")
     if path.suffix in (".mcap", ".db3") or (path.is_dir() and is_bag(path)):
         return "mcap"
     if path.suffix == ".xml" or any(path.glob(f"**/{TRACKLETS}")):
         return "kitti-raw"
     for folder, format in ("label_02", "kitti-tracking"), ("label_2", "kitti"):
-        if label_folder(path, folder) != path:
+        if find_label_folder(path, folder) != path:
             return format
     for file in files:
-        found = _by_text(file) if file.suffix == ".txt" else _by_json(read_json(file))
+        found = _recognise_text(file) if file.suffix == ".txt" else _recognise_json(read_json(file))
         if found:
             return found
-    raise InputError(f"{path} holds no labels that are recognised, or none at all; say with --from "
-                     f"which of {', '.join(READERS)} they are")
+    raise InputError(f"no labels are recognised in {path}; give their format with --from, one of "
+                     f"{', '.join(READERS)}")
 
 
-def _by_text(file: Path) -> str:
-    """Tell the format by how many numbers precede the class in the first line."""
+def _recognise_text(file: Path) -> str:
+    """Recognise the format by how many numbers precede the class in the first line."""
     words = read_text(file, MAX_BYTES).lstrip().partition("\n")[0].split()
     if words and words[0].endswith(":"):
         return ""  # a calibration
-    before = 0
+    numbers = 0
     with suppress(ValueError):
         for word in words:
             float(word)
-            before += 1
-    if before == 0:
+            numbers += 1
+    if numbers == 0:
         return "kitti" if len(words) > 3 else ""
-    return "kitti-tracking" if before == 2 else "openpcdet" if before == 7 else ""
+    return "kitti-tracking" if numbers == 2 else "openpcdet" if numbers == 7 else ""
 
 
-def _by_json(content: Any) -> str:
-    """By the keys; "" for a file without a box, such as of labelCloud and SUSTechPOINTS, and for
-    one of something else, whose values may be of any kind."""
+def _recognise_json(content: Any) -> str:
+    """Recognise the format by the keys.
+
+    "" for a file without boxes, such as of labelCloud and SUSTechPOINTS, and for other JSON files,
+    whose values may be of any type.
+    """
     with suppress(TypeError, LookupError, AttributeError):
         if isinstance(content, list) or "objs" in content:
             boxes = content if isinstance(content, list) else content["objs"]

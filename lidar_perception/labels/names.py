@@ -1,4 +1,4 @@
-"""The names of formats: one spelling, others accepted."""
+"""Names of formats and their aliases."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from lidar_perception.types import unknown_name
 ALIASES = {"kitti-object": "kitti", "bag": "mcap", "bag-labels": "mcap-labels"}
 
 
-def format_name(name: str, known: Iterable[str]) -> str:
-    """Return the name of a format as it is in `known`, in any case, with hyphens or underscores.
+def resolve_format(name: str, known: Iterable[str]) -> str:
+    """Return the name of a format as spelt in `known`; case, hyphens and underscores do not matter.
 
     Raises:
         InputError: `known` has no such name.
     """
-    plain = name.strip().lower().replace("_", "-")
-    plain, known = ALIASES.get(plain, plain), list(known)
-    if plain not in known:
+    normalised = name.strip().lower().replace("_", "-")
+    normalised, known = ALIASES.get(normalised, normalised), list(known)
+    if normalised not in known:
         raise unknown_name("format", name, known)
-    return plain
+    return normalised

@@ -101,12 +101,12 @@ def label(data: Path, sequence: str | None, out: Path | None, detector: Detector
 def _format_and_path(option: str, text: str) -> tuple[str, str]:
     """Split FORMAT:PATH. InputError for an unknown format, UsageError without a path."""
     from lidar_perception.labels.exchange import FORMATS, READERS
-    from lidar_perception.labels.names import format_name
+    from lidar_perception.labels.names import resolve_format
     named, _, path = text.partition(":")
     if not path:
         raise click.UsageError(f"{option} {text} must be FORMAT:PATH, such as "
                                "openlabel:labels.json")
-    return format_name(named, READERS if option == "--import" else FORMATS), path
+    return resolve_format(named, READERS if option == "--import" else FORMATS), path
 
 
 def _serve(drive: Drive, made: Session, port: int, browser: bool, propose: bool,

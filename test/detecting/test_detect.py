@@ -300,7 +300,7 @@ def test_another_run_in_the_folder_is_refused_and_forced(kitti, tmp_path, monkey
     assert len(made) == 8 and not (out / "detections.csv").exists()
     assert not [*out.glob("kitti/*")] and len(objects(read_json(out))["000000"]) == 2
     write(tmp_path / "mine/letter.txt", "dear")
-    assert "holds no run" in refused(monkeypatch, capsys, kitti, "--out", tmp_path / "mine")
+    assert "has no run of this command" in refused(monkeypatch, capsys, kitti, "--out", tmp_path / "mine")
 
 
 # What cannot be used
@@ -402,7 +402,7 @@ def test_a_film_that_cannot_be_made_is_refused_before_any_work(drives, tmp_path,
 def test_pictures_say_when_they_are(stamp, timed, expected, tmp_path):
     frames = [Frame.of(str(i), cloud_frame(scene(i), stamp + i * 10**9 - 15 * 10**8))
               for i in range(2)]
-    run = made_run(Recording(tmp_path / "drive", "", frames, timed=timed), tmp_path / "out")
+    run = made_run(Recording(tmp_path / "drive", "", frames, has_times=timed), tmp_path / "out")
     drawer = FrameDrawer(run)
     drawer.stage_of(FrameResult(frames[0], Detections.none(), "velodyne", 1.0))
     assert drawer.time(stamp) == expected

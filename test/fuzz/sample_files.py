@@ -21,7 +21,7 @@ from lidar_perception.data.kitti import write as kitti
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.semantickitti import format_calibration, format_pose, write_scan
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.labels.drive_labels import DriveLabels, of_truth
+from lidar_perception.labels.drive_labels import DriveLabels, read_frame_labels
 from lidar_perception.labels.exchange import export_labels
 from lidar_perception.runs.files import write_bytes, write_text
 from lidar_perception.simulation.camera import FORWARD_CAMERA
@@ -60,7 +60,7 @@ def write_samples(root: Path) -> None:
         FORWARD_CAMERA, pose=lambda: np.eye(4)) for i in range(FRAMES)])
     drive = open_recording(root / "bag/drive").frames
     for format, place in LABELS.items():
-        export_labels(DriveLabels(list(map(of_truth, drive))), format, root / place, drive)
+        export_labels(DriveLabels(list(map(read_frame_labels, drive))), format, root / place, drive)
     write_text(root / "pcd/0.pcd", "\n".join([
         "VERSION 0.7", "FIELDS x y z intensity", "SIZE 4 4 4 4", "TYPE F F F F", "COUNT 1 1 1 1",
         "WIDTH 20", "HEIGHT 1", "POINTS 20", "DATA ascii",

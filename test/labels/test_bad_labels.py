@@ -1,4 +1,4 @@
-"""Labels that cannot be used: one line says which and what to do, and nothing is half-written."""
+"""Invalid labels: one line names the problem and the remedy, and nothing is partly written."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cli_samples import error_line, exit_of
-from format_samples import drive, labels_of
+from format_samples import drive, make_labels
 from samples import object_folder, walker_truth
 
 from lidar_perception.cli import convert
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labels.datasets import LAYOUTS, write_dataset
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
-from lidar_perception.labels.exchange import FORMATS, export_labels, import_labels, recognised
+from lidar_perception.labels.exchange import FORMATS, export_labels, import_labels, recognise_format
 from lidar_perception.types import InputError
 
 CLOUD = {"folder": "", "filename": "", "path": "", "objects": [
@@ -30,24 +30,25 @@ RESULT = {"results": {"0000/000005": [{
     "sample_token": "0000/000005", "translation": [1, 2, 3], "size": [1, 2, 1],
     "rotation": [1, 0, 0, 0], "velocity": [0, 0], "detection_name": "car", "detection_score": 1.0,
     "attribute_name": ""}]}}
-GOOD = {"labelcloud": ("000005.json", CLOUD), "sustech": ("000005.json", PSR),
-        "openlabel": ("0000.json", CUBOID), "nuscenes-detection": ("r.json", RESULT),
-        "kitti": ("000005.txt", "Car 0 0 0 0 0 9 9 1.5 1.6 3.9 0 1.7 15 0\n"),
-        "kitti-tracking": ("0000.txt", "5 1 Car 0 0 0 0 0 9 9 1.5 1.6 3.9 0 1.7 15 0\n")}
-WRONG = [  # format, what is put in place of what, what is said
+VALID = {"labelcloud": ("000005.json", CLOUD), "sustech": ("000005.json", PSR),
+         "openlabel": ("0000.json", CUBOID), "nuscenes-detection": ("r.json", RESULT),
+         "kitti": ("000005.txt", "Car 0 0 0 0 0 9 9 1.5 1.6 3.9 0 1.7 15 0\n"),
+         "kitti-tracking": ("0000.txt", "5 1 Car 0 0 0 0 0 9 9 1.5 1.6 3.9 0 1.7 15 0\n")}
+INVALID = [  # format, text that is replaced, replacement, words of the error
     ("labelcloud", '"x": 1', '"x": NaN', "box 1 of 1: its numbers must be finite"),
     ("labelcloud", '"x": 1', '"x": 1e308', "within 100000 m"),
-    ("labelcloud", '"name"', '"track_id": 10000000000000000000, "name"', "no whole number"),
+    ("labelcloud", '"name"', '"track_id": 10000000000000000000, "name"', "not an integer"),
     ("labelcloud", '"length": 4', '"length": 0', "its sides above 0"),
     ("labelcloud", '"centroid"', '"centre"', "has no 'centroid'"),
-    ("labelcloud", '"name": "Car",', '"name": "Car"', ":1 is no JSON: Expecting ',' delimiter"),
+    ("labelcloud", '"name": "Car",', '"name": "Car"',
+     ":1 is not valid JSON: Expecting ',' delimiter"),
     ("labelcloud", '"objects"', '"boxes"', "has no 'objects'"),
     ("sustech", '"x": 1', '"x": 1e999', "must be finite"),
     ("sustech", '"psr"', '"p"', "has no 'psr'"),
-    ("sustech", "[", "{", ":1 is no JSON"),
+    ("sustech", "[", "{", ":1 is not valid JSON"),
     ("openlabel", "[1, 2", "[NaN, 2", "frame 5, box 1 of 1"),
-    ("openlabel", "[1, 2, 3, 0, 0", "[1, 2, 3", "a cuboid of 8 numbers"),
-    ("openlabel", '"5"', '"50"', "has the frame '50' (1 such), and the drive has 5 to 7"),
+    ("openlabel", "[1, 2, 3, 0, 0", "[1, 2, 3", "a cuboid has 8 numbers"),
+    ("openlabel", '"5"', '"50"', "has the frame '50' (1 unknown frames), but the drive has 5 to 7"),
     ("openlabel", '"5": {', '"5": {"frame_properties": 7, ', "cannot be read"),
     ("openlabel", '"openlabel"', '"vcd"', "has no 'openlabel'"),
     ("nuscenes-detection", "[1, 2, 3]", "[1, 2, NaN]", "sample 0000/000005, box 1 of 1"),
@@ -55,7 +56,8 @@ WRONG = [  # format, what is put in place of what, what is said
     ("nuscenes-detection", "0000/000005", "other", "has none of the drive's samples"),
     ("kitti", "3.9", "nan", "000005.txt:1 is not a KITTI label"),
     ("kitti", "Car 0", "Car 1e308", "000005.txt:1 is not a KITTI label"),
-    ("kitti-tracking", "5 1 Car", "51 1 Car", "0000.txt:1 is of frame 51, and the drive has 5"),
+    ("kitti-tracking", "5 1 Car", "51 1 Car",
+     "0000.txt:1 belongs to frame 51, but the drive has 5"),
 ]
 
 
@@ -63,42 +65,42 @@ def text(content):
     return content if isinstance(content, str) else json.dumps(content)
 
 
-def put(folder, format, old="", new=""):
-    name, content = GOOD[format]
+def write_labels(folder, format, old="", new=""):
+    name, content = VALID[format]
     folder.mkdir(exist_ok=True)
     assert old in text(content)
     (folder / name).write_text(text(content).replace(old, new, 1))
     return folder / name if format == "nuscenes-detection" else folder
 
 
-@pytest.mark.parametrize("format", GOOD)
-def test_the_examples_are_good(format, tmp_path):
-    path = put(tmp_path / "in", format)
-    assert recognised(path) == format
-    assert import_labels(path, format, drive("one")).boxes == 1
+@pytest.mark.parametrize("format", VALID)
+def test_the_unchanged_examples_are_valid(format, tmp_path):
+    path = write_labels(tmp_path / "in", format)
+    assert recognise_format(path) == format
+    assert import_labels(path, format, drive("one")).box_count == 1
 
 
-def test_a_folder_of_kitti_is_told_by_its_folders(tmp_path):
-    """Not by the first text file there, which is of the calibration."""
+def test_kitti_folder_is_recognised_by_its_folders(tmp_path):
+    """The first text file is a calibration."""
     write_dataset("kitti-tracking", drive("one"), tmp_path / "set")
     for path in tmp_path / "set", tmp_path / "set/training":
-        assert recognised(path) == "kitti-tracking"
-    with pytest.raises(InputError, match="no labels that are recognised"):
-        recognised(tmp_path / "set/training/calib")
+        assert recognise_format(path) == "kitti-tracking"
+    with pytest.raises(InputError, match="no labels are recognised"):
+        recognise_format(tmp_path / "set/training/calib")
 
 
 @pytest.mark.parametrize("content", [
     5, None, [], [5], {"objs": 5}, {"objs": {}}, {"objects": 5}, {"objects": [5]}, {"results": 5},
     {"results": {"a": 5}}, {"results": {"a": [5]}}])
-def test_a_file_of_something_else_is_not_recognised(content, tmp_path):
+def test_other_json_files_are_not_recognised(content, tmp_path):
     (tmp_path / "0.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="no labels that are recognised"):
-        recognised(tmp_path)
+    with pytest.raises(InputError, match="no labels are recognised"):
+        recognise_format(tmp_path)
 
 
-@pytest.mark.parametrize(("format", "old", "new", "words"), WRONG)
-def test_what_is_wrong_is_named_with_its_file(format, old, new, words, tmp_path):
-    path = put(tmp_path / "in", format, old, new)
+@pytest.mark.parametrize(("format", "old", "new", "words"), INVALID)
+def test_invalid_labels_are_reported_with_their_file(format, old, new, words, tmp_path):
+    path = write_labels(tmp_path / "in", format, old, new)
     with pytest.raises(InputError) as error:
         import_labels(path, format, drive("one"))
     assert words in str(error.value) and str(tmp_path / "in") in str(error.value)
@@ -107,40 +109,40 @@ def test_what_is_wrong_is_named_with_its_file(format, old, new, words, tmp_path)
 
 @pytest.mark.parametrize("format", ["labelcloud", "sustech", "kitti", "kitti-tracking",
                                     "openlabel"])
-def test_labels_of_what_the_drive_has_not_and_no_labels_are_named(format, tmp_path):
-    path = put(tmp_path / "in", format)
-    suffix = GOOD[format][0][-5:].lstrip("0123456789")
+def test_unknown_or_missing_label_files_are_reported(format, tmp_path):
+    path = write_labels(tmp_path / "in", format)
+    suffix = VALID[format][0][-5:].lstrip("0123456789")
     stranger = path / f"000099{suffix}"
-    stranger.write_text(text(GOOD[format][1]))
-    with pytest.raises(InputError, match="is of no frame of the drive"):
+    stranger.write_text(text(VALID[format][1]))
+    with pytest.raises(InputError, match="belongs to no frame of the drive"):
         import_labels(path, format, drive("one"))
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="has no label file"):
+    with pytest.raises(InputError, match="has no label files"):
         import_labels(tmp_path / "empty", format, drive("one"))
-    with pytest.raises(InputError, match=r"there is no folder|cannot read"):
+    with pytest.raises(InputError, match=r"does not exist|cannot read"):
         import_labels(tmp_path / "none", format, drive("one"))
 
 
-def test_the_command_knows_every_format_and_layout():
+def test_convert_offers_all_formats_and_layouts():
     assert (convert.LABELS, convert.DATASETS) == (tuple(FORMATS), tuple(LAYOUTS))
 
 
-def test_numbers_that_are_none_never_become_labels():
+def test_invalid_numbers_are_rejected():
     for box in ([np.nan, *[1] * 6], [*[1] * 6, np.inf], [1, 1, 1, 1, 1, -1, 0], [1e6, *[1] * 6]):
         with pytest.raises(InputError, match="frame 7, box 1 of 1"):
             FrameLabels.of("7", 0, [box], ["Car"])
     with pytest.raises(InputError, match="seven numbers"):
         FrameLabels.of("7", 0, [[1, 2]], ["Car"])
     for track in 2.5, np.nan, 2**63, 10**30:
-        with pytest.raises(InputError, match="a whole number as track id"):
+        with pytest.raises(InputError, match="an integer track id"):
             FrameLabels.of("7", 0, [[1] * 7], ["Car"], [track])
-    with pytest.raises(InputError, match="each box needs one"):
+    with pytest.raises(InputError, match="each box needs one of each"):
         FrameLabels.of("7", 0, [[1] * 7], [])
 
 
 @pytest.mark.parametrize("format", FORMATS)
 @pytest.mark.parametrize("key", ["rotation", "tracking_id", "uid", "truncated", "openlabel_cuboid"])
-def test_fields_of_another_tool_are_kept_or_refused_in_one_line(key, format, tmp_path):
+def test_fields_of_other_tools_are_kept_or_rejected(key, format, tmp_path):
     frames = drive("one")
     for value in None, "x", {}, [0] * 4, [10**400] * 4, [1, 0, 0, 0]:
         labels = DriveLabels([FrameLabels.of(frame.name, frame.stamp_ns, [[5, 1, 0, 4, 2, 1, 0.1]],
@@ -148,26 +150,26 @@ def test_fields_of_another_tool_are_kept_or_refused_in_one_line(key, format, tmp
                               for frame in frames])
         try:
             export_labels(labels, format, tmp_path / "out", frames, force=True)
-            assert import_labels(tmp_path / "out", format, frames).boxes == len(frames)
+            assert import_labels(tmp_path / "out", format, frames).box_count == len(frames)
         except InputError as error:
             assert "\n" not in str(error) and key not in ("rotation", "tracking_id", "uid")
 
 
-def test_numbers_that_no_float_holds_go_through_every_format(tmp_path):
-    """Beside a box, where nobody computes with them."""
+def test_huge_integers_survive_every_format(tmp_path):
+    """In extra fields, which nobody computes with."""
     frames = drive("one")
-    path = put(tmp_path / "in", "labelcloud", '"name"', f'"n": {10**400}, "name"')
+    path = write_labels(tmp_path / "in", "labelcloud", '"name"', f'"n": {10**400}, "name"')
     labels = import_labels(path, "labelcloud", frames)
-    for format in set(FORMATS) - {"kitti", "kitti-tracking"}:  # which have no place for it
+    for format in set(FORMATS) - {"kitti", "kitti-tracking"}:  # they have no extra fields
         export_labels(labels, format, tmp_path / format, frames)
         back, = import_labels(tmp_path / format, format, frames).frames[0].extra
         assert back["n"] == 10**400
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_what_is_there_is_replaced_by_force_only(format, tmp_path):
+def test_existing_labels_are_replaced_only_with_force(format, tmp_path):
     frames = drive("one")
-    labels, other = (labels_of(frames, format, seed) for seed in (0, 1))
+    labels, other = (make_labels(frames, format, seed) for seed in (0, 1))
     export_labels(labels, format, tmp_path / "out", frames)
     with pytest.raises(InputError, match="exists already"):
         export_labels(other, format, tmp_path / "out", frames)
@@ -176,58 +178,58 @@ def test_what_is_there_is_replaced_by_force_only(format, tmp_path):
     np.testing.assert_allclose(found.frames[0].boxes.sum(), other.frames[0].boxes.sum(), atol=1e-4)
 
 
-def test_force_removes_nothing_that_it_does_not_write(tmp_path):
+def test_force_keeps_other_files(tmp_path):
     frames = drive("one")
-    export_labels(labels_of(frames, "sustech"), "sustech", tmp_path / "out", frames)
+    export_labels(make_labels(frames, "sustech"), "sustech", tmp_path / "out", frames)
     (tmp_path / "out/notes.txt").write_text("mine")
     with pytest.raises(InputError, match=r"would not be replaced \(1, such as notes.txt\)"):
-        export_labels(labels_of(frames, "sustech", 1), "sustech", tmp_path / "out", frames, True)
+        export_labels(make_labels(frames, "sustech", 1), "sustech", tmp_path / "out", frames, True)
     assert (tmp_path / "out/notes.txt").read_text() == "mine"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out"]
 
 
 @pytest.fixture
-def room():
-    """room(bytes): no file may grow larger; a write beyond fails as it does on a full disk."""
+def limit_file_size():
+    """Return a function that limits the size of files, as a full disk does."""
     _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, hard))
 
 
 @pytest.mark.parametrize("format", sorted(FORMATS.keys() - {"mcap", "mcap-labels"}))
-def test_on_a_full_disk_nothing_is_half_written(format, tmp_path, room):
+def test_nothing_is_partly_written_on_a_full_disk(format, tmp_path, limit_file_size):
     frames = drive("one")
-    export_labels(labels_of(frames, format), format, tmp_path / "old", frames)
+    export_labels(make_labels(frames, format), format, tmp_path / "old", frames)
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     for out, force in (("old", True), ("new", False)):
-        room(100)
+        limit_file_size(100)
         with pytest.raises(InputError, match=f"cannot write .*{out}"):
-            export_labels(labels_of(frames, format, 1), format, tmp_path / out, frames, force)
-        room(resource.RLIM_INFINITY)
+            export_labels(make_labels(frames, format, 1), format, tmp_path / out, frames, force)
+        limit_file_size(resource.RLIM_INFINITY)
         assert before == {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
 
 
-def test_a_data_set_is_whole_or_not_there(tmp_path, room):
+def test_data_set_is_written_completely_or_not_at_all(tmp_path, limit_file_size):
     frames = drive("one")
     broken = replace(frames[2], load=lambda: (_ for _ in ()).throw(InputError("scan 2 is cut")))
     with pytest.raises(InputError, match="scan 2 is cut"):
         write_dataset("kitti", [*frames[:2], broken], tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
-    room(600)
+    limit_file_size(600)
     with pytest.raises(InputError, match=r"cannot write .*out/training/velodyne/000000\.bin"):
         write_dataset("kitti", frames, tmp_path / "out")
-    room(resource.RLIM_INFINITY)
+    limit_file_size(resource.RLIM_INFINITY)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_kitti_and_nuscenes_say_what_they_lack(tmp_path):
+def test_missing_calibration_or_pose_is_reported(tmp_path):
     bare = [replace(f, pose=lambda: None) for f in drive("one", camera=False)]
     with pytest.raises(InputError, match="no camera calibration"):
-        export_labels(labels_of(bare, "kitti"), "kitti", tmp_path / "k", bare)
+        export_labels(make_labels(bare, "kitti"), "kitti", tmp_path / "k", bare)
     with pytest.raises(InputError, match="has no pose"):
-        export_labels(labels_of(bare, "openlabel"), "nuscenes-tracking", tmp_path / "n", bare)
+        export_labels(make_labels(bare, "openlabel"), "nuscenes-tracking", tmp_path / "n", bare)
     for format in ("openlabel", "sustech", "labelcloud", "mcap"):
-        export_labels(labels_of(bare, format), format, tmp_path / format, bare)
+        export_labels(make_labels(bare, format), format, tmp_path / format, bare)
     assert not (tmp_path / "k").exists() and not (tmp_path / "n").exists()
 
 
@@ -237,17 +239,18 @@ def test_kitti_and_nuscenes_say_what_they_lack(tmp_path):
     (["{bag}", "--to", "kitti", "--detections", "/none", "--out", "{out}"],
      "has no topic /none; it has /camera/camera_info"),
     (["{bag}", "--to", "openlabel", "--detections", "/points", "--out", "{out}"],
-     "/points is sensor_msgs/msg/PointCloud2, and labels are"),
+     "/points is sensor_msgs/msg/PointCloud2, but labels are"),
     (["{bag}", "--points", "/lidar", "--to", "nuscenes", "--out", "{out}"], "has no topic /lidar"),
     (["{bag}", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"],
-     "/ground_truth/detections has labels of"),
+     "/ground_truth/detections has labels at"),
     (["{bag}", "--data", "{kitti}", "--detections", "/none", "--to", "openlabel", "--out", "{out}"],
      "has no topic /none"),
     (["{empty}", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"],
-     "holds no labels that are recognised"),
-    (["{kitti}/none", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"], "there is no"),
+     "no labels are recognised in"),
+    (["{kitti}/none", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"],
+     "does not exist"),
 ])
-def test_convert_says_in_one_line_what_cannot_be(arguments, words, tmp_path, monkeypatch, capsys):
+def test_convert_reports_errors_in_one_line(arguments, words, tmp_path, monkeypatch, capsys):
     root = object_folder(tmp_path / "kitti")
     write_bag(tmp_path / "bag", [replace(frame, pose=lambda: None, truth=walker_truth)
                                  for frame in drive("one")])

@@ -1,4 +1,4 @@
-"""Data set -> bag -> data set: the same frames, boxes, labels of points and poses."""
+"""Conversion of data sets to bags and back: frames, boxes, point labels and poses are kept."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cli_samples import error_line, exit_of
-from format_samples import CALIBRATION, drive, labels_of, pose, same
+from format_samples import CALIBRATION, drive, make_labels, pose, same
 from nuscenes_folder import make_tables, save
 from robot_bags import ON_BASE, base_at, mount, moving, moving_tf, recorded, stamps
 from samples import DATA, needs_data
@@ -19,7 +19,7 @@ from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labels.datasets import write_dataset
-from lidar_perception.labels.drive_labels import DriveLabels, of_truth
+from lidar_perception.labels.drive_labels import DriveLabels, read_frame_labels
 from lidar_perception.labels.exchange import export_labels
 from lidar_perception.labels.formats import bag as bag_format
 from lidar_perception.robot.poses import invert_pose, transform_boxes
@@ -64,7 +64,7 @@ def same_frames(recording, others, boxes=1e-5, points=0.0):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_simulated_data_set_comes_back_from_its_bag(layout, made, tmp_path):
+def test_simulated_data_set_survives_conversion(layout, made, tmp_path):
     recording = open_recording(made / layout)
     write_bag(tmp_path / "bag", recording)
     bag = open_recording(tmp_path / "bag")
@@ -73,7 +73,7 @@ def test_a_simulated_data_set_comes_back_from_its_bag(layout, made, tmp_path):
     back = open_recording(tmp_path / "back")
     assert (back.layout, back.has) == (recording.layout, recording.has)
     same_frames(recording, back)
-    if layout != "semantickitti":  # the labels are the same files
+    if layout != "semantickitti":  # label files are identical
         for file in (made / layout).glob("training/label_*/*.txt"):
             other = tmp_path / "back" / file.relative_to(made / layout)
             assert other.read_text().split() == file.read_text().split()
@@ -81,7 +81,7 @@ def test_a_simulated_data_set_comes_back_from_its_bag(layout, made, tmp_path):
 
 @needs_data
 @pytest.mark.parametrize("folder", REAL)
-def test_a_real_data_set_comes_back_from_its_bag(folder, tmp_path):
+def test_real_data_set_survives_conversion(folder, tmp_path):
     recording = open_recording(DATA / folder)
     recording = recording.select([frame.name for frame in recording.frames[:4]])
     write_bag(tmp_path / "bag", recording)
@@ -91,13 +91,13 @@ def test_a_real_data_set_comes_back_from_its_bag(folder, tmp_path):
 
 @pytest.fixture(scope="module")
 def simulated(streets, tmp_path_factory):
-    """The bag of a simulated drive, as `simulate` writes it."""
+    """Return the bag of a simulated drive."""
     path = tmp_path_factory.mktemp("bags") / "drive"
     write_bag(path, simulated_scans(5, 4, SMALL))
     return path
 
 
-def test_a_simulated_drive_comes_back_from_nuscenes_tables(simulated, tmp_path):
+def test_simulated_drive_survives_conversion_to_nuscenes(simulated, tmp_path):
     summary = write_dataset("nuscenes", open_recording(simulated), tmp_path / "n")
     assert all(remark.startswith("written as another class: ") for remark in summary.remarks)
     recording, back = list(open_recording(simulated)), list(open_recording(tmp_path / "n"))
@@ -105,12 +105,12 @@ def test_a_simulated_drive_comes_back_from_nuscenes_tables(simulated, tmp_path):
     tracks = {}
     for frame, other in zip(recording, back, strict=True):
         scan, again = frame.load(), other.load()
-        away = (np.abs(scan.xyz[:, :2]) >= 1.0).any(axis=1)  # what nuScenes takes for the vehicle
+        away = (np.abs(scan.xyz[:, :2]) >= 1.0).any(axis=1)  # nearer points are on the vehicle
         np.testing.assert_allclose(again.xyz, scan.xyz[away], atol=1e-5)
         np.testing.assert_allclose(again.intensity, scan.intensity[away], atol=1e-6)
         np.testing.assert_allclose(other.pose(), frame.pose(), atol=1e-6)
         assert other.sensor_height == frame.sensor_height
-        truth, labels = frame.truth(), of_truth(other)
+        truth, labels = frame.truth(), read_frame_labels(other)
         np.testing.assert_allclose(labels.boxes, truth.boxes, atol=1e-6)
         for name, found, extra, track in zip(truth.labels, labels.class_names, truth.extras,
                                              labels.track_ids.tolist()):
@@ -126,48 +126,47 @@ def frames_at(seconds, **more):
 
 
 @pytest.mark.parametrize("kind", ["tables", "results"])
-def test_labels_of_a_vehicle_that_leans_come_back_from_nuscenes_as_they_were(kind, tmp_path):
-    """Its boxes are upright in the global frame, ours in the vehicle's; what was not moved is
-    written as it was read."""
+def test_labels_of_a_tilted_vehicle_are_written_as_read(kind, tmp_path):
+    """nuScenes' boxes are upright in the global frame, ours in the vehicle's."""
     tables = make_tables(frames=2, objects=8, scenes=("scene-0001",))
     recording = open_recording(save(tmp_path / "there", tables))
     if kind == "tables":
         write_dataset("nuscenes", recording, tmp_path / "back")
         written = json.loads(next(tmp_path.glob("back/*/sample_annotation.json")).read_text())
     else:
-        labels = DriveLabels(list(map(of_truth, recording)))
+        labels = DriveLabels(list(map(read_frame_labels, recording)))
         export_labels(labels, "nuscenes-detection", tmp_path / "r.json", recording.frames)
         results = json.loads((tmp_path / "r.json").read_text())["results"]
         written = [row for rows in results.values() for row in rows]
     counts = ("num_lidar_pts", "num_radar_pts")
-    there = {tuple(np.round(row["translation"], 3)): row for row in tables["sample_annotation"]}
-    assert len(written) == len(there) > 8
+    rows = {tuple(np.round(row["translation"], 3)): row for row in tables["sample_annotation"]}
+    assert len(written) == len(rows) > 8
     for row in written:
-        like = there[tuple(np.round(row["translation"], 3))]
-        np.testing.assert_allclose(row["rotation"], like["rotation"], atol=1e-9)
-        np.testing.assert_allclose(row["size"], like["size"], atol=1e-6)
-        assert kind == "results" or [row[key] for key in counts] == [like[key] for key in counts]
+        old = rows[tuple(np.round(row["translation"], 3))]
+        np.testing.assert_allclose(row["rotation"], old["rotation"], atol=1e-9)
+        np.testing.assert_allclose(row["size"], old["size"], atol=1e-6)
+        assert kind == "results" or [row[key] for key in counts] == [old[key] for key in counts]
 
 
-def test_without_a_camera_one_is_assumed_and_numbers_follow_the_time(tmp_path):
-    """A missing scan leaves its number free; after a gap the next drive begins."""
+def test_missing_camera_is_assumed_and_numbers_follow_time(tmp_path):
+    """A missing scan leaves a gap in the numbers; after a longer gap a new drive starts."""
     frames = frames_at([0, 0.1, 0.31, 0.4, 30, 30.07, 30.13], pose=np.eye(4).copy)
-    labels = labels_of(frames, "kitti-tracking")
+    labels = make_labels(frames, "kitti-tracking")
     summary = write_dataset("kitti-tracking", frames, tmp_path / "k", labels)
     assert (summary.frames, summary.drives) == (7, 2)
     assert {remark.split(":")[0]: n for remark, n in summary.remarks.items()} == {
-        "assumed": 7, "left out": 7, "without a track id, which tracking needs": 6}
+        "assumed": 7, "left out": 7, "without a track id": 6}
     back = open_recording(tmp_path / "k")
     assert [frame.name for frame in back] == [
         *(f"0000/{i:06}" for i in (0, 1, 3, 4)), *(f"0001/{i:06}" for i in range(3))]
-    found = DriveLabels([replace(of_truth(frame), name=a.name, stamp_ns=a.stamp_ns)
+    found = DriveLabels([replace(read_frame_labels(frame), name=a.name, stamp_ns=a.stamp_ns)
                          for a, frame in zip(frames, back)])
     same(labels, found, 2e-6)
 
 
 @pytest.mark.parametrize("layout", REAL)
 @pytest.mark.parametrize("height", [0.62, SENSOR_HEIGHT, 2.9])
-def test_the_sensor_is_as_high_in_the_folder_as_in_the_recording(tmp_path, layout, height):
+def test_sensor_height_is_kept(tmp_path, layout, height):
     points = PointTruth(np.zeros(3, np.uint16), np.zeros(3, np.uint16))
     frames = frames_at([0, 0.1], point_truth=lambda: points, sensor_height=height)
     write_dataset(layout, frames, tmp_path / "folder")
@@ -176,7 +175,7 @@ def test_the_sensor_is_as_high_in_the_folder_as_in_the_recording(tmp_path, layou
     assert open_recording(tmp_path / "folder", sensor_height=1.0).frames[0].sensor_height == 1.0
 
 
-def test_point_labels_need_columns_and_go_only_where_they_fit(tmp_path, monkeypatch, capsys):
+def test_point_labels_are_written_where_the_layout_has_them(tmp_path, monkeypatch, capsys):
     points = PointTruth(np.array([40, 252, 0], np.uint16), np.array([0, 7, 65535], np.uint16))
     write_bag(tmp_path / "labelled", frames_at([0, 0.1], point_truth=lambda: points,
                                                calibration=CALIBRATION))
@@ -187,15 +186,15 @@ def test_point_labels_need_columns_and_go_only_where_they_fit(tmp_path, monkeypa
         assert frame.point_truth().instances.tolist() == [0, 7, 65535]
     assert exit_of(monkeypatch, "convert", tmp_path / "labelled", "--to", "kitti", "--out",
                    tmp_path / "k") == 0
-    assert "left out: points' labels" in capsys.readouterr().out
+    assert "left out: point labels" in capsys.readouterr().out
     assert exit_of(monkeypatch, "convert", tmp_path / "bare", "--to", "semantickitti", "--out",
                    tmp_path / "none") == 2
-    assert "has no labels of points" in error_line(capsys)
+    assert "has no point labels" in error_line(capsys)
     assert not (tmp_path / "none").exists() and not list(tmp_path.glob(".*"))
 
 
 def test_detections_on_a_topic_become_labels(tmp_path, monkeypatch):
-    """MarkerArray of this package's nodes, and Detection3DArray of any, of tracks too."""
+    """MarkerArray of our nodes, and Detection3DArray of any node, also of tracks."""
     frames, rng = drive("one"), np.random.default_rng(2)
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/found", "visualization_msgs/msg/MarkerArray")
@@ -221,8 +220,8 @@ def test_detections_on_a_topic_become_labels(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("parts", [[moving(ODOMETRY), mount()], [moving_tf(), mount()], []])
-def test_boxes_in_another_frame_are_brought_to_that_of_the_clouds(parts, tmp_path):
-    """As target_frame:=odom gives them. Where nothing connects the two, that is said."""
+def test_boxes_are_transformed_to_the_frame_of_the_clouds(parts, tmp_path):
+    """Nodes with target_frame:=odom publish such boxes. Unconnected frames are reported."""
     boxes = np.array([[10.0, 2, 0.5, 4, 2, 1.5, 0.3]])
     rows = []
     for stamp in stamps():
@@ -246,7 +245,7 @@ def test_boxes_in_another_frame_are_brought_to_that_of_the_clouds(parts, tmp_pat
         np.testing.assert_allclose(shown.tracks[0]["boxes"][i][1:8], near[0], atol=1e-3)
 
 
-def test_scans_of_one_stamp_are_all_there_and_labels_go_to_no_other_scan(tmp_path):
+def test_scans_with_equal_stamps_are_kept(tmp_path):
     twice = frames_at([0.0, 0.1, 0.1])
     write_dataset("nuscenes", twice, tmp_path / "nuscenes")
     assert len({f.points for f in open_recording(tmp_path / "nuscenes")}) == 3
@@ -257,16 +256,16 @@ def test_scans_of_one_stamp_are_all_there_and_labels_go_to_no_other_scan(tmp_pat
                      skipped=skipped) == 2
     assert "another labelled scan has the same stamp" in skipped[0]
     unset = [replace(f, stamp_ns=0) for f in frames_at([0, 1])]
-    with BagWriter(tmp_path / "unset") as bag:  # a driver that sets no stamp
+    with BagWriter(tmp_path / "unset") as bag:  # some drivers set no stamp
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
         for i, frame in enumerate(unset, 5):
             bag.write(POINTS, i * 10**9, cloud_message(frame.load().xyz, 0, "top"))
     assert [f.stamp_ns for f in open_recording(tmp_path / "unset")] == [5 * 10**9, 6 * 10**9]
 
 
-def test_results_of_a_bag_become_a_data_set(simulated, tmp_path, monkeypatch, capsys):
+def test_detections_of_a_bag_become_a_data_set(simulated, tmp_path, monkeypatch, capsys):
     recording = list(open_recording(simulated))
-    labels = DriveLabels(list(map(of_truth, recording)))
+    labels = DriveLabels(list(map(read_frame_labels, recording)))
     export = tmp_path / "labels"
     bag_format.write(labels, export, recording)
     for topic in ("/ground_truth/detections", "/ground_truth/detections_3d"):
@@ -274,10 +273,10 @@ def test_results_of_a_bag_become_a_data_set(simulated, tmp_path, monkeypatch, ca
         assert exit_of(monkeypatch, "convert", export, "--to", "kitti-tracking", "--detections",
                        topic, "--out", out) == 0
         back = open_recording(out)
-        found = DriveLabels([replace(of_truth(f), name=a.name, stamp_ns=a.stamp_ns)
+        found = DriveLabels([replace(read_frame_labels(f), name=a.name, stamp_ns=a.stamp_ns)
                              for a, f in zip(recording, back)])
         expected = labels
-        if topic.endswith("3d"):  # which has a score for everything
+        if topic.endswith("3d"):  # each box has a score
             expected = DriveLabels([replace(f, scores=np.ones(len(f))) for f in labels.frames])
         same(expected, found, 2e-6)
     assert exit_of(monkeypatch, "convert", export, "--detections", "/odom", "--out",
@@ -285,7 +284,7 @@ def test_results_of_a_bag_become_a_data_set(simulated, tmp_path, monkeypatch, ca
     capsys.readouterr()
 
 
-def test_poses_lead_to_the_same_world(tmp_path):
+def test_poses_are_relative_to_the_first_scan(tmp_path):
     frames = [replace(f, point_truth=lambda: PointTruth(np.zeros(50, np.uint16),
                                                         np.zeros(50, np.uint16)))
               for f in drive("one", frames=3)]

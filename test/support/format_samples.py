@@ -1,4 +1,4 @@
-"""Drives without files and made-up labels of them, for the tests of formats."""
+"""Drives without files and synthetic labels, for the tests of formats."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CALIBRATION = Calibration(INTRINSICS, LIDAR_TO_CAMERA, 1242, 375)
 DRIVES = {"one": ("0000",), "several": ("0003", "0011")}
 NOTES = ("openlabel", "mcap", "mcap-labels")
 KITTI = ("kitti", "kitti-tracking")
-# What a format rounds, metres and radians.
+# Rounding error of each format, metres and radians.
 EXACT = {"kitti": 2e-6, "kitti-tracking": 2e-6, "openlabel": 1e-12,
          "nuscenes-detection": 1e-9, "nuscenes-tracking": 1e-9, "labelcloud": 1e-8,
          "labelcloud-rel": 1e-8, "labelcloud-vertices": 5e-8, "sustech": 1e-12, "mcap": 1e-12,
@@ -24,33 +24,34 @@ EXACT = {"kitti": 2e-6, "kitti-tracking": 2e-6, "openlabel": 1e-12,
 
 
 def pose(i: int) -> np.ndarray:
-    """Where the LiDAR is in frame i, on a slope."""
-    turn, rise = 0.1 * i, 0.02
-    about_z = np.array([[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0],
+    """Return the pose of the LiDAR in frame i, on a slope."""
+    yaw, pitch = 0.1 * i, 0.02
+    about_z = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0],
                         [0, 0, 1]])
-    about_y = np.array([[math.cos(rise), 0, math.sin(rise)], [0, 1, 0],
-                        [-math.sin(rise), 0, math.cos(rise)]])
-    at = np.eye(4)
-    at[:3, :3], at[:3, 3] = about_z @ about_y, [100 + 2.0 * i, -50, 3]
-    return at
+    about_y = np.array([[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0],
+                        [-math.sin(pitch), 0, math.cos(pitch)]])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = about_z @ about_y, [100 + 2.0 * i, -50, 3]
+    return matrix
 
 
 def drive(name: str, frames: int = 3, camera: bool = True) -> list[Frame]:
-    """Frames of each of the sequences of one of DRIVES; the numbers begin at 5."""
+    """Return frames of each sequence of a drive; numbers start at 5."""
     rng = np.random.default_rng(0)
-    found = []
+    made = []
     for s, sequence in enumerate(DRIVES[name]):
         for i in range(5, 5 + frames):
             stamp = 1_700_000_000_000_000_000 + (100 * s + i) * 100_000_000
             xyz = rng.uniform(-20, 20, (50, 3)).astype(np.float32)
-            found.append(Frame.of(f"{sequence}/{i:06}", PointCloud.of(xyz, None, stamp, "velodyne"),
-                                  calibration=CALIBRATION if camera else None,
-                                  pose=pose(i).copy, sequence=sequence, index=i))
-    return found
+            made.append(Frame.of(f"{sequence}/{i:06}", PointCloud.of(xyz, None, stamp, "velodyne"),
+                                 calibration=CALIBRATION if camera else None,
+                                 pose=pose(i).copy, sequence=sequence, index=i))
+    return made
 
 
-def labels_of(frames: list[Frame], format: str, seed: int = 0) -> DriveLabels:
-    """Boxes all around the sensor with all that a format keeps; the second frame has none."""
+def make_labels(frames: list[Frame], format: str, seed: int = 0) -> DriveLabels:
+    """Return boxes around the sensor with all fields that a format keeps; the second frame has
+    none."""
     rng = np.random.default_rng(seed)
     names = ["Car", "Pedestrian", "Van", "Cyclist", "e-scooter"]
     found = []
@@ -72,7 +73,7 @@ def labels_of(frames: list[Frame], format: str, seed: int = 0) -> DriveLabels:
 
 
 def same(labels: DriveLabels, others: DriveLabels, tolerance: float) -> None:
-    """Boxes within the tolerance, and the rest of each box, whatever their order is."""
+    """Assert equal labels in any order, with boxes within the tolerance."""
     assert [f.name for f in labels.frames] == [f.name for f in others.frames]
     assert [f.stamp_ns for f in labels.frames] == [f.stamp_ns for f in others.frames]
     for a, b in zip(labels.frames, others.frames):

@@ -1,1 +1,1 @@
-"""One file a format of labels: read(path, frames) and write(labels, out, frames)."""
+"""One module per label format, with read(path, frames) and write(labels, out, frames)."""

@@ -1,7 +1,7 @@
-"""A rosbag2 bag with the labels as MarkerArray and Detection3DArray, beside the clouds or alone.
+"""Labels in a rosbag2 bag, as MarkerArray and Detection3DArray, with or without clouds.
 
 A message belongs to the frame of its header.stamp. Numbers are exact. Detection3DArray has one
-class, a score and an id for each box; what else is known is in the text of the markers.
+class, score and id per box; other fields are in the text of the markers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from lidar_perception.data.bag import Bag, BagHandle
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.frame import Frame, read_frame_id
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels, FrameLabels, to_truth
+from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels, FrameLabels, to_ground_truth
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import TRUTH
 from msg_utils.detections import from_detection_array
@@ -27,15 +27,17 @@ MARKERS, DETECTIONS = "visualization_msgs/msg/MarkerArray", "vision_msgs/msg/Det
 
 
 def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels:
-    """The boxes on a topic, MarkerArray or Detection3DArray, of this or any other node. Ids are
-    those of tracks: track_id in the text of a label, id in that of a track; of a Detection3DArray,
-    unless it numbers what each message has."""
+    """Read the boxes on a topic, MarkerArray or Detection3DArray, of any node.
+
+    Track ids are `track_id` in the text of a label marker, and `id` in that of a track marker. Ids
+    of a Detection3DArray are track ids unless they only number the boxes of each message.
+    """
     stamps = {frame.stamp_ns for frame in frames}
     with Bag(path) as bag:
         bag.require(topic)
         if bag.topics[topic] not in (MARKERS, DETECTIONS):
-            raise InputError(f"{path}: {topic} is {bag.topics[topic]}, and labels are "
-                             f"{MARKERS} or {DETECTIONS}; give another topic")
+            raise InputError(f"{path}: {topic} is {bag.topics[topic]}, but labels are {MARKERS} or "
+                             f"{DETECTIONS}; give another topic")
         markers = bag.topics[topic] == MARKERS
         found: dict[int, MarkedObjects] = {}
         poses = BagPoses(BagHandle(path), read_frame_id(frames))
@@ -43,26 +45,27 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
             objects = from_marker_array(msg) if markers else from_detection_array(msg)
             stamp_ns = objects.stamp_ns or (0 if 0 in stamps else time)
             found[stamp_ns] = poses.to_cloud_frame(objects, topic)
-    if strange := sorted(found.keys() - stamps):
-        raise InputError(f"{path}: {topic} has labels of {strange[0]} ns ({len(strange)} of "
-                         f"{len(found)} such), when the drive has no frame; give the drive that "
-                         "they belong to")
-    tracked = markers or any(sorted(o.ids.tolist()) != list(range(len(o))) for o in found.values())
-    return DriveLabels([_labels(frame, found.get(frame.stamp_ns), markers, tracked,
-                                f"{path}, {topic} at {frame.stamp_ns} ns") for frame in frames])
+    if unknown := sorted(found.keys() - stamps):
+        raise InputError(f"{path}: {topic} has labels at {unknown[0]} ns ({len(unknown)} of "
+                         f"{len(found)} such stamps), where the drive has no frame; give the drive "
+                         "that was labelled")
+    has_ids = markers or any(sorted(o.ids.tolist()) != list(range(len(o))) for o in found.values())
+    return DriveLabels([_make_frame_labels(frame, found.get(frame.stamp_ns), markers, has_ids,
+                                           f"{path}, {topic} at {frame.stamp_ns} ns")
+                        for frame in frames])
 
 
-def _labels(frame: Frame, objects: MarkedObjects | None, markers: bool, tracked: bool,
-            where: str) -> FrameLabels:
+def _make_frame_labels(frame: Frame, objects: MarkedObjects | None, markers: bool, has_ids: bool,
+                       where: str) -> FrameLabels:
     if objects is None:
         return FrameLabels.of(frame.name, frame.stamp_ns)
     extra = [dict(e) for e in objects.extras]
     ids = [NO_TRACK] * len(objects)
-    for k, each in enumerate(extra):
+    for k, fields in enumerate(extra):
         if markers:
-            ids[k] = each.pop("track_id", each.pop("id", NO_TRACK) if "velocity" in each
-                              else NO_TRACK)
-        elif tracked:
+            ids[k] = fields.pop("track_id", fields.pop("id", NO_TRACK) if "velocity" in fields
+                                else NO_TRACK)
+        elif has_ids:
             ids[k] = int(objects.ids[k])
     scores = [e.pop("score", np.nan) for e in extra] if markers else objects.scores
     names = [e.pop("class_name", label) for e, label in zip(extra, objects.labels)]
@@ -72,13 +75,13 @@ def _labels(frame: Frame, objects: MarkedObjects | None, markers: bool, tracked:
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False,
           clouds: bool = True) -> None:
-    """out: the folder of the bag, with clouds, poses and the camera of the frames."""
-    write_bag(out, (replace(frame, truth=partial(to_truth, each))
+    """Write a bag with the labels, clouds, poses and camera of the frames to the folder `out`."""
+    write_bag(out, (replace(frame, truth=partial(to_ground_truth, each))
                     for frame, each in zip(frames, labels.frames)),
               force=force, clouds=clouds, detections_3d=True)
 
 
 def write_labels(labels: DriveLabels, out: Path, frames: Sequence[Frame],
                  force: bool = False) -> None:
-    """out: the folder of a bag without clouds."""
+    """Write a bag with the labels, without clouds, to the folder `out`."""
     write(labels, out, frames, force, clouds=False)

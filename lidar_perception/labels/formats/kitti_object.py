@@ -1,4 +1,4 @@
-"""KITTI's object benchmark, label_2: one text file a frame, a line a box. It has no track ids."""
+"""KITTI's object benchmark, label_2: one text file per frame, without track ids."""
 
 from __future__ import annotations
 
@@ -9,33 +9,38 @@ from pathlib import Path
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.labels import format_label, parse_lines
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
-from lidar_perception.labels.formats.files import check_all_known, frame_files
-from lidar_perception.labels.formats.kitti_lines import frame_labels, label_folder, lines_of
+from lidar_perception.labels.formats.files import check_label_files, list_frame_files
+from lidar_perception.labels.formats.kitti_lines import (
+    find_label_folder,
+    make_lines,
+    parse_frame_labels,
+)
 from lidar_perception.runs.files import write_bytes, write_folder
 
-# KITTI's files have two decimals; what was computed has up to six.
+# KITTI's files have two decimals; computed numbers have up to six.
 ZEROS = re.compile(r"(\.\d\d\d*?)0+(?=\s|$)")
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """path: a folder with FRAME.txt, or one of the object layout. A frame without a file has no
+    """Read a folder with FRAME.txt, or one of the object layout. A frame without a file has no
     labels."""
-    path = label_folder(path, "label_2")
-    files = frame_files(path, frames, ".txt")
-    check_all_known(path, files, ".txt")
-    return DriveLabels([frame_labels(
+    path = find_label_folder(path, "label_2")
+    files = list_frame_files(path, frames, ".txt")
+    check_label_files(path, files, ".txt")
+    return DriveLabels([parse_frame_labels(
         frame, [line for _, line in parse_lines(file)] if file.exists() else [],
         file) for frame, file in zip(frames, files)])
 
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
-    """out: a folder, for a file of each frame."""
+    """Write a file per frame to the folder `out`."""
     with write_folder(out, force) as folder:
-        for each, frame, file in zip(labels.frames, frames, frame_files(folder, frames, ".txt")):
-            write_bytes(file, text_of_frame(each, frame).encode())
+        files = list_frame_files(folder, frames, ".txt")
+        for frame_labels, frame, file in zip(labels.frames, frames, files):
+            write_bytes(file, format_frame(frame_labels, frame).encode())
 
 
-def text_of_frame(labels: FrameLabels, frame: Frame) -> str:
-    """The lines of a frame."""
+def format_frame(labels: FrameLabels, frame: Frame) -> str:
+    """Return the lines of a frame."""
     return "".join(ZEROS.sub(r"\1", format_label(line, 6)) + "\n"
-                   for line in lines_of(labels, frame, levels=False))
+                   for line in make_lines(labels, frame, levels=False))

@@ -1,7 +1,7 @@
-"""Tracklets of KITTI's raw drives, as CVAT and Datumaro export them: one XML file a drive.
+"""Tracklets of KITTI's raw drives, as CVAT and Datumaro export them: one XML file per drive.
 
-data.kitti.labels.read_tracklets reads the boxes. frame_list.txt in the same folder gives the number
-of each frame by its name.
+data.kitti.labels.read_tracklets reads the boxes. frame_list.txt in the same folder maps the names
+of frames to their numbers.
 """
 
 from __future__ import annotations
@@ -14,39 +14,49 @@ from pathlib import Path
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.labels import read_tracklets
 from lidar_perception.data.kitti.raw import FRAME_LIST, TRACKLETS, read_frame_list
-from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels, of_rows, of_truth
-from lidar_perception.labels.formats.files import sequences_of
+from lidar_perception.labels.drive_labels import (
+    DriveLabels,
+    FrameLabels,
+    make_frame_labels,
+    read_frame_labels,
+)
+from lidar_perception.labels.formats.files import group_by_sequence
 from lidar_perception.types import InputError
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read FILE.xml or a folder with tracklet_labels.xml; of several drives a folder with
-    DRIVE/tracklet_labels.xml. A drive without a file has no labels."""
-    drives = sequences_of(frames)
+    """Read FILE.xml, a folder with tracklet_labels.xml, or with DRIVE/tracklet_labels.xml of
+    several drives.
+
+    A drive without a file has no labels.
+    """
+    drives = group_by_sequence(frames)
     if path.is_file() and len(drives) > 1:
-        raise InputError(f"{path} is one file, and the frames are of {len(drives)} drives; give a "
-                         "folder, or choose a drive with --split")
+        raise InputError(f"{path} is one file, but the frames belong to {len(drives)} drives; give "
+                         "a folder, or choose a drive with --split")
     labels: list[FrameLabels] = []
     found = False
     for drive, positions in drives.items():
         files = (path, path / TRACKLETS) if len(drives) == 1 else ()
         file = next((file for file in (*files, path / drive / TRACKLETS) if file.is_file()), None)
         found = found or file is not None
-        own = [frames[i] for i in positions]
-        labels += [of_rows(frame, ()) for frame in own] if file is None else _of_file(file, own)
+        drive_frames = [frames[i] for i in positions]
+        labels += ([make_frame_labels(frame, ()) for frame in drive_frames] if file is None
+                   else _read_drive(file, drive_frames))
     if not found:
-        raise InputError(f"{path} has no {TRACKLETS}; give the folder that has it")
+        raise InputError(f"{path} has no {TRACKLETS}; give the folder that contains it")
     return DriveLabels(labels)
 
 
-def _of_file(path: Path, frames: Sequence[Frame]) -> list[FrameLabels]:
-    names = path.with_name(FRAME_LIST)
-    known = read_frame_list(names) if names.exists() else {}
-    numbers = [known.get(frame.name.rpartition("/")[2], frame.index) for frame in frames]
+def _read_drive(path: Path, frames: Sequence[Frame]) -> list[FrameLabels]:
+    frame_list = path.with_name(FRAME_LIST)
+    numbers_by_name = read_frame_list(frame_list) if frame_list.exists() else {}
+    numbers = [numbers_by_name.get(frame.name.rpartition("/")[2], frame.index) for frame in frames]
     truth = read_tracklets(path)
-    # Tracks go on over scans that are missing.
-    if strange := sorted(n for n in truth if not min(numbers) <= n <= max(numbers)):
-        raise InputError(f"{path} has the frame {strange[0]} ({len(strange)} such), and the drive "
-                         f"has {min(numbers)} to {max(numbers)}; give the drive that was labelled")
-    return [of_truth(replace(frame, truth=partial(truth.get, number)))
+    # Tracks continue over missing scans, so numbers within the drive are allowed.
+    if unknown := sorted(n for n in truth if not min(numbers) <= n <= max(numbers)):
+        raise InputError(f"{path} has the frame {unknown[0]} ({len(unknown)} unknown frames), but "
+                         f"the drive has {min(numbers)} to {max(numbers)}; give the drive that was "
+                         "labelled")
+    return [read_frame_labels(replace(frame, truth=partial(truth.get, number)))
             for frame, number in zip(frames, numbers)]

@@ -1,11 +1,11 @@
-"""labelCloud's JSON files, one a frame: a centroid and rotations, or eight vertices.
+"""labelCloud's JSON files, one per frame: a centroid and rotations, or eight vertices.
 
-Rotations are about z, then the turned y, then the turned x: in degrees, 0 to 360 (centroid_abs), or
-in radians, -pi to pi (centroid_rel). The length runs along the x axis that they turn. Vertices go
-around the bottom from the rear right corner over the rear left one, then around the top, where
-labelCloud's manual has the names of a viewer who looks along y. Numbers have eight decimals, as its
-own. It reads classes and format from _classes.json beside its labels, and forgets fields that are
-not its own when it saves.
+Rotations are about z, then the rotated y, then the rotated x: in degrees, 0 to 360 (centroid_abs),
+or in radians, -pi to pi (centroid_rel). The length is along the rotated x axis. Vertices go around
+the bottom from the rear right corner over the rear left one, then around the top, as seen by the
+viewer in labelCloud's manual, who looks along y. Numbers have eight decimals, as in labelCloud. It
+reads classes and format from _classes.json in the same folder, and drops unknown fields when it
+saves.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from lidar_perception.labels.drive_labels import (
     DriveLabels,
     FrameLabels,
     Row,
-    ids_and_score,
-    of_rows,
-    unchanged,
+    get_id_and_score,
+    is_unchanged,
+    make_frame_labels,
 )
 from lidar_perception.labels.formats.files import (
-    beside,
-    check_all_known,
-    extra_of,
-    frame_files,
-    in_file,
+    check_label_files,
+    extract_extra,
+    list_frame_files,
+    merge_extra,
     read_json,
+    report_format_errors,
     write_json,
 )
 from lidar_perception.runs.files import write_folder
@@ -43,37 +43,37 @@ from msg_utils.markers import COLORS, OTHER_COLOR
 
 ROOT, CLASSES_FILE, SUFFIX = "labelcloud", "_classes.json", ".json"
 DECIMALS = 8
-CORNERS = [2, 1, 0, 3, 6, 5, 4, 7]  # of geometry.box_corners
+CORNERS = [2, 1, 0, 3, 6, 5, 4, 7]  # order of geometry.box_corners in labelCloud
 ABSOLUTE, RELATIVE, VERTICES = KINDS = "centroid_abs", "centroid_rel", "vertices"
 TILTED = "labelcloud_tilted"
 OWN = {"name", "centroid", "dimensions", "rotations", "vertices", "track_id", "score"}
 
 
 def _read(kind: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """path: a folder with FRAME.json. A frame without a file has no labels."""
-    files = frame_files(path, frames, SUFFIX)
-    check_all_known(path, files, SUFFIX, but=(CLASSES_FILE,))
+    """Read a folder with FRAME.json. A frame without a file has no labels."""
+    files = list_frame_files(path, frames, SUFFIX)
+    check_label_files(path, files, SUFFIX, ignored=(CLASSES_FILE,))
     classes = path / CLASSES_FILE
-    if classes.exists():  # it says in which way labelCloud wrote
-        said = read_json(classes)
-        found = said.get("format") if isinstance(said, dict) else None
-        kind = found if found in KINDS else kind
+    if classes.exists():  # it states the format
+        content = read_json(classes)
+        stated = content.get("format") if isinstance(content, dict) else None
+        kind = stated if stated in KINDS else kind
     labels, heads = [], {}
     for frame, file in zip(frames, files):
         content = read_json(file) if file.exists() else {"objects": []}
-        rows = in_file(str(file), partial(_rows, content, kind))
-        labels.append(of_rows(frame, rows, where=file))
+        rows = report_format_errors(str(file), partial(_parse_objects, content, kind))
+        labels.append(make_frame_labels(frame, rows, where=file))
         if file.exists():
             heads[frame.name] = {k: v for k, v in content.items() if k != "objects"}
     return DriveLabels(labels, {ROOT: heads})
 
 
-def _rows(content: dict[str, Any], kind: str) -> list[Row]:
+def _parse_objects(content: dict[str, Any], kind: str) -> list[Row]:
     rows: list[Row] = []
     for item in content["objects"]:
-        extra = extra_of(item, OWN)
+        extra = extract_extra(item, OWN)
         shape = {key: item[key] for key in ("rotations", "vertices") if key in item}
-        box, tilted = _box(item, kind)
+        box, tilted = _parse_box(item, kind)
         if tilted:
             extra[TILTED] = {**shape, "unit": kind, "box": box}
         rows.append((box, str(item["name"]), int(item.get("track_id", NO_TRACK)),
@@ -81,8 +81,8 @@ def _rows(content: dict[str, Any], kind: str) -> list[Row]:
     return rows
 
 
-def _box(item: dict[str, Any], kind: str) -> tuple[list[float], bool]:
-    """[x y z l w h yaw], and whether it leans."""
+def _parse_box(item: dict[str, Any], kind: str) -> tuple[list[float], bool]:
+    """Return [x y z l w h yaw], and True if the box is tilted."""
     if "vertices" in item:
         corners = np.array(item["vertices"], float).reshape(8, 3)
         edges = np.array([corners[3] - corners[0] + corners[2] - corners[1],
@@ -92,8 +92,8 @@ def _box(item: dict[str, Any], kind: str) -> tuple[list[float], bool]:
         return ([*corners.mean(axis=0).tolist(), *sides.tolist(),
                  math.atan2(edges[0, 1], edges[0, 0])],
                 bool(np.abs([*edges[:2, 2], *edges[2, :2]]).max() > 1e-6))
-    turns = [item["rotations"][axis] for axis in "xyz"]
-    x, y, z = turns if kind == RELATIVE else np.radians(turns).tolist()
+    angles = [item["rotations"][axis] for axis in "xyz"]
+    x, y, z = angles if kind == RELATIVE else np.radians(angles).tolist()
     yaw = z if math.cos(y) > 0 else z + math.pi
     return ([item["centroid"][axis] for axis in "xyz"]
             + [item["dimensions"][side] for side in ("length", "width", "height")]
@@ -103,44 +103,47 @@ def _box(item: dict[str, Any], kind: str) -> tuple[list[float], bool]:
 
 def _write(kind: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
            force: bool = False) -> None:
-    """out: a folder, for FRAME.json of each frame and _classes.json."""
+    """Write FRAME.json of each frame and _classes.json to the folder `out`."""
     names = sorted({name for each in labels.frames for name in each.class_names})
     heads = labels.extra.get(ROOT, {})
     with write_folder(out, force) as folder:
-        for each, frame, file in zip(labels.frames, frames, frame_files(folder, frames, SUFFIX)):
+        files = list_frame_files(folder, frames, SUFFIX)
+        for frame_labels, frame, file in zip(labels.frames, frames, files):
             cloud = frame.points or Path(f"{file.stem}.pcd")
+            objects = [_make_object(frame_labels, k, kind) for k in range(len(frame_labels))]
             write_json(file, {"folder": cloud.parent.name, "filename": cloud.name,
                               "path": str(cloud), **heads.get(frame.name, {}),
-                              "objects": [_object(each, k, kind) for k in range(len(each))]}, 1)
+                              "objects": objects}, 1)
         write_json(folder / CLASSES_FILE, {
-            "classes": [{"name": name, "id": i, "color": _color(name)}
+            "classes": [{"name": name, "id": i, "color": _to_hex_color(name)}
                         for i, name in enumerate(names)],
             "default": 0, "type": "object_detection", "format": kind,
             "created_with": {"name": "lidar_perception", "version": ""}}, 1)
 
 
-def _object(labels: FrameLabels, k: int, kind: str) -> dict[str, Any]:
+def _make_object(labels: FrameLabels, k: int, kind: str) -> dict[str, Any]:
     box, extra = labels.boxes[k], dict(labels.extra[k])
     x, y, z, length, width, height, _ = box.round(DECIMALS).tolist()
     kept = extra.pop(TILTED, None)
     shape: dict[str, Any]
-    if kept and kept["unit"] == kind and unchanged(box, kept["box"]):
+    if kept and kept["unit"] == kind and is_unchanged(box, kept["box"]):
         shape = {key: kept[key] for key in ("rotations", "vertices") if key in kept}
     elif kind == VERTICES:
         shape = {"vertices": box_corners(box[None])[0][CORNERS].round(DECIMALS).tolist()}
     else:
-        turn = math.degrees(box[6]) % 360 if kind == ABSOLUTE else math.remainder(box[6], math.tau)
-        turn = round(turn, DECIMALS)
-        shape = {"rotations": {"x": 0, "y": 0, "z": turn % 360 if kind == ABSOLUTE else turn}}
+        yaw = math.degrees(box[6]) % 360 if kind == ABSOLUTE else math.remainder(box[6], math.tau)
+        yaw = round(yaw, DECIMALS)
+        shape = {"rotations": {"x": 0, "y": 0, "z": yaw % 360 if kind == ABSOLUTE else yaw}}
     if kind != VERTICES:
         shape = {"centroid": {"x": x, "y": y, "z": z},
                  "dimensions": {"length": length, "width": width, "height": height}, **shape}
-    return {**beside(extra, OWN), "name": labels.class_names[k], **shape,
-            **ids_and_score(labels, k)}
+    return {**merge_extra(extra, OWN), "name": labels.class_names[k], **shape,
+            **get_id_and_score(labels, k)}
 
 
-def _color(name: str) -> str:
+def _to_hex_color(name: str) -> str:
     return "#" + "".join(f"{round(255 * part):02x}" for part in COLORS.get(name, OTHER_COLOR))
 
 
-absolute, relative, vertices = ((partial(_read, kind), partial(_write, kind)) for kind in KINDS)
+absolute_format, relative_format, vertices_format = (
+    (partial(_read, kind), partial(_write, kind)) for kind in KINDS)

@@ -1,10 +1,10 @@
-"""Result files of nuScenes' detection and tracking tasks: one JSON file, a list of boxes for each
-sample, in the global frame, to which the recording's poses lead.
+"""Result files of nuScenes' detection and tracking tasks: one JSON file with a list of boxes per
+sample.
 
-size is [width length height], rotation [w x y z], with x to the front. A frame that is none of
-nuScenes' has its name as token. Fields that nuScenes does not know are written beside its own, and
-nuscenes-devkit passes over them; classes that it does not know are written as they are, and it
-refuses them.
+Boxes are in the global frame, so the recording needs poses. size is [width length height], rotation
+is [w x y z], with x to the front. The token of a frame that is not nuScenes' is its name.
+Additional fields are written next to nuScenes' own and ignored by nuscenes-devkit; unknown classes
+are written under their names and rejected by it.
 """
 
 from __future__ import annotations
@@ -34,177 +34,193 @@ from lidar_perception.labels.drive_labels import (
     DriveLabels,
     FrameLabels,
     Row,
-    of_rows,
-    unchanged,
+    is_unchanged,
+    make_frame_labels,
 )
 from lidar_perception.labels.formats.files import (
-    beside,
-    extra_of,
-    in_file,
+    assign_track_ids,
+    collect_track_names,
+    extract_extra,
+    merge_extra,
     read_json,
-    track_names,
-    track_numbers,
+    report_format_errors,
 )
 from lidar_perception.runs.files import check_unused, write_text
 from lidar_perception.types import InputError
 
 ROOT = "nuscenes"
-NO_SCORE = -1.0    # as nuscenes-devkit writes labels
-OURS = {**CLASS_BY_NAME, **{theirs: ours for ours, theirs in NAME_BY_CLASS.items()}}
-THEIRS = {ours: theirs for theirs, ours in OURS.items()}
-# What is theirs under another name of ours, which stands beside it: vans are cars.
-LIKE = {row.name: THEIRS[row.looks_like] for row in TABLE if row.looks_like in THEIRS}
-WRITTEN = {**THEIRS, **LIKE}
-# What is ours with a rider, and theirs also without one.
-RIDDEN, NOT_RIDDEN = OURS.keys() - CLASS_BY_NAME.keys(), "cycle.without_rider"
+NO_SCORE = -1.0    # of labels, as in nuscenes-devkit
+OUR_NAMES = {**CLASS_BY_NAME, **{theirs: ours for ours, theirs in NAME_BY_CLASS.items()}}
+NUSCENES_NAMES = {ours: theirs for theirs, ours in OUR_NAMES.items()}
+# nuScenes' class for those of our classes that it lacks, such as vans; our name is kept as a field.
+SIMILAR_NAMES = {row.name: NUSCENES_NAMES[row.looks_like] for row in TABLE
+                 if row.looks_like in NUSCENES_NAMES}
+WRITTEN_NAMES = {**NUSCENES_NAMES, **SIMILAR_NAMES}
+# nuScenes' classes that are ours only with a rider.
+RIDDEN_CLASSES, NOT_RIDDEN = OUR_NAMES.keys() - CLASS_BY_NAME.keys(), "cycle.without_rider"
 OWN = {"sample_token", "translation", "size", "rotation", "velocity", "tracking_id",
        "attribute_name"}
 
 
-def _token(frame: Frame) -> str:
+def _get_token(frame: Frame) -> str:
     return str(getattr(frame.native, "token", frame.name))
 
 
-def _pose(frame: Frame) -> np.ndarray:
+def _require_pose(frame: Frame) -> np.ndarray:
     pose = frame.pose()
     if pose is None:
-        raise InputError(f"frame {frame.name} has no pose, and nuScenes' boxes are in a fixed "
-                         "frame; take openlabel, labelcloud or sustech, which need none")
+        raise InputError(f"frame {frame.name} has no pose, but nuScenes' boxes are in a fixed "
+                         "frame; use openlabel, labelcloud or sustech, which need no poses")
     return pose
 
 
 def _read(task: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Boxes of samples that the drive has not are left out: one file is of many drives."""
+    """Read a file. Boxes of samples that the drive does not have are ignored: a file has many
+    drives."""
     content = read_json(path)
-    results = in_file(str(path), lambda: dict(content["results"]))
-    if not results.keys() & {_token(frame) for frame in frames}:
-        raise InputError(f"{path} has none of the drive's samples, whose first is "
-                         f"{_token(frames[0])}; give the results of this drive")
-    ids = in_file(str(path), lambda: track_numbers({str(row.get("tracking_id", ""))
-                                                    for rows in results.values()
-                                                    for row in rows} - {""}))
+    results = report_format_errors(str(path), lambda: dict(content["results"]))
+    if not results.keys() & {_get_token(frame) for frame in frames}:
+        raise InputError(f"{path} has none of the drive's samples, the first of which is "
+                         f"{_get_token(frames[0])}; give the results of this drive")
+    ids = report_format_errors(str(path), lambda: assign_track_ids({str(row.get("tracking_id", ""))
+                                                                    for rows in results.values()
+                                                                    for row in rows} - {""}))
     labels = []
     for frame in frames:
-        where = f"{path}, sample {_token(frame)}"
-        rows = in_file(where, partial(_rows, task, frame, results.get(_token(frame), []), ids))
-        labels.append(of_rows(frame, rows, where=where))
+        where = f"{path}, sample {_get_token(frame)}"
+        boxes = results.get(_get_token(frame), [])
+        rows = report_format_errors(where, partial(_parse_boxes, task, frame, boxes, ids))
+        labels.append(make_frame_labels(frame, rows, where=where))
     return DriveLabels(labels, {ROOT: {key: v for key, v in content.items() if key != "results"}})
 
 
-def _rows(task: str, frame: Frame, boxes: list[dict[str, Any]], ids: dict[str, int]) -> list[Row]:
+def _parse_boxes(task: str, frame: Frame, boxes: list[dict[str, Any]],
+                 ids: dict[str, int]) -> list[Row]:
     rows: list[Row] = []
-    pose = _pose(frame) if boxes else np.eye(4)  # without a box there is no need of one
+    pose = _require_pose(frame) if boxes else np.eye(4)  # without boxes, no pose is needed
     for row in boxes:
         kind, attribute = str(row[f"{task}_name"]), row.get("attribute_name", "")
-        rest = extra_of(row, OWN | {f"{task}_name", f"{task}_score"})
+        extra = extract_extra(row, OWN | {f"{task}_name", f"{task}_score"})
         if attribute:
-            rest["attribute"] = attribute
-        if (velocity := _finite(row.get("velocity"))) is not None:
-            rest["velocity"] = velocity
-        box, leans = _in_frame(row, pose)
-        if leans:
-            rest["rotation"] = row["rotation"]
+            extra["attribute"] = attribute
+        if (velocity := _parse_velocity(row.get("velocity"))) is not None:
+            extra["velocity"] = velocity
+        box, tilted = _to_local_box(row, pose)
+        if tilted:
+            extra["rotation"] = row["rotation"]
         track = str(row.get("tracking_id", ""))
         if track and track != str(ids[track]):
-            rest["tracking_id"] = track
+            extra["tracking_id"] = track
         score = float(row.get(f"{task}_score", NO_SCORE))
-        if (finer := rest.get("class_name")) in LIKE and LIKE[finer] == kind:
-            kind = rest.pop("class_name")
-        kind = kind if attribute == NOT_RIDDEN else OURS.get(kind, kind)
-        rows.append((box, kind, ids.get(track, NO_TRACK), np.nan if score < 0 else score, rest))
+        if SIMILAR_NAMES.get(extra.get("class_name", "")) == kind:
+            kind = extra.pop("class_name")
+        kind = kind if attribute == NOT_RIDDEN else OUR_NAMES.get(kind, kind)
+        rows.append((box, kind, ids.get(track, NO_TRACK), np.nan if score < 0 else score, extra))
     return rows
 
 
-def _finite(velocity: Any) -> list[float] | None:
-    known = velocity is not None and None not in velocity and np.isfinite(velocity).all()
-    return [float(v) for v in velocity] if known else None
+def _parse_velocity(velocity: Any) -> list[float] | None:
+    valid = velocity is not None and None not in velocity and np.isfinite(velocity).all()
+    return [float(v) for v in velocity] if valid else None
 
 
-def _in_frame(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], bool]:
-    """The box, and whether it leans there."""
+def _to_local_box(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], bool]:
+    """Return the box in the frame with this pose, and True if it is tilted there."""
     width, length, height = row["size"]
-    one = GlobalBoxes.of([row["translation"]], [[length, width, height]], [row["rotation"]], 0)
-    if not are_valid_rotations(one.rotations).all():
-        raise ValueError("a rotation is no quaternion")
-    return to_local_boxes(one, pose)[0].tolist(), bool(are_tilted(one, pose)[0])
+    box = GlobalBoxes.of([row["translation"]], [[length, width, height]], [row["rotation"]], 0)
+    if not are_valid_rotations(box.rotations).all():
+        raise ValueError("a rotation is not a quaternion")
+    return to_local_boxes(box, pose)[0].tolist(), bool(are_tilted(box, pose)[0])
 
 
-def rotation_read(labels: FrameLabels, k: int, pose: np.ndarray) -> list[float] | None:
-    """[w x y z] with which a box that leans was read, where it is still there; else None."""
+def find_read_rotation(labels: FrameLabels, k: int, pose: np.ndarray) -> list[float] | None:
+    """Return the rotation [w x y z] with which a tilted box was read; None if it was moved
+    since."""
     rotation, box = labels.extra[k].get("rotation"), labels.boxes[k]
     if not isinstance(rotation, list) or len(rotation) != 4:
         return None
     centre, size, _ = to_global_boxes(box[None], pose)
-    place = {"translation": centre[0], "size": size[0][[1, 0, 2]], "rotation": rotation}
-    with suppress(ValueError, TypeError, OverflowError):  # another tool's field of this name
-        return rotation if unchanged(box, _in_frame(place, pose)[0]) else None
+    placement = {"translation": centre[0], "size": size[0][[1, 0, 2]], "rotation": rotation}
+    with suppress(ValueError, TypeError, OverflowError):  # a field of another tool
+        return rotation if is_unchanged(box, _to_local_box(placement, pose)[0]) else None
     return None
 
 
 def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
            force: bool = False) -> None:
-    """out: one JSON file. Velocities that the labels do not have are those of the tracks, from
-    frame to frame; NaN, which nuscenes-devkit reads, where there is none."""
+    """Write one JSON file.
+
+    Missing velocities are computed from the tracks, from frame to frame; NaN, which nuscenes-devkit
+    can read, if that is not possible.
+    """
     check_unused(out, force)
-    poses = {i: _pose(frame) for i, frame in enumerate(frames) if len(labels.frames[i])}
-    speeds, names = _velocities(labels, frames, poses), track_names(labels.frames, "tracking_id")
+    poses = {i: _require_pose(frame) for i, frame in enumerate(frames) if len(labels.frames[i])}
+    velocities = _compute_velocities(labels, frames, poses)
+    names = collect_track_names(labels.frames, "tracking_id")
     results = {}
-    for i, (each, frame) in enumerate(zip(labels.frames, frames)):
-        placed = format_boxes(_token(frame), *to_global_boxes(
-            each.boxes, poses[i])) if len(each) else []
-        results[_token(frame)] = [
-            {**place, **_columns(task, each, k, poses[i], speeds.get((i, k), [np.nan] * 2), names)}
-            for k, place in enumerate(placed)]
+    for i, (frame_labels, frame) in enumerate(zip(labels.frames, frames)):
+        placements = format_boxes(_get_token(frame), *to_global_boxes(
+            frame_labels.boxes, poses[i])) if len(frame_labels) else []
+        results[_get_token(frame)] = [
+            {**placement, **_make_columns(task, frame_labels, k, poses[i],
+                                          velocities.get((i, k), [np.nan] * 2), names)}
+            for k, placement in enumerate(placements)]
     write_text(out, json.dumps({"meta": META, **labels.extra.get(ROOT, {}), "results": results}))
 
 
-def _columns(task: str, labels: FrameLabels, k: int, pose: np.ndarray,
-             velocity: list[float], names: dict[int, str]) -> dict[str, Any]:
-    """What else a box says, see _write."""
+def _make_columns(task: str, labels: FrameLabels, k: int, pose: np.ndarray,
+                  velocity: list[float], names: dict[int, str]) -> dict[str, Any]:
+    """Return the fields of a box except its position and size, see _write."""
     kind, track = labels.class_names[k], int(labels.track_ids[k])
     extra = dict(labels.extra[k])
     attribute = extra.pop("attribute", None) or ""
-    if kind in RIDDEN:
+    if kind in RIDDEN_CLASSES:
         attribute = NOT_RIDDEN
-    elif THEIRS.get(kind) in RIDDEN and attribute == NOT_RIDDEN:
-        attribute = ""  # a person said otherwise
+    elif NUSCENES_NAMES.get(kind) in RIDDEN_CLASSES and attribute == NOT_RIDDEN:
+        attribute = ""  # a person changed the class
     extra.pop("tracking_id", None)
-    if kind in LIKE:
+    if kind in SIMILAR_NAMES:
         extra["class_name"] = kind
-    if isinstance(said := extra.pop("velocity", None), list) and len(said) == 2:
-        velocity = _finite(said) or velocity
+    if isinstance(given := extra.pop("velocity", None), list) and len(given) == 2:
+        velocity = _parse_velocity(given) or velocity
     columns = {"velocity": velocity, "attribute_name": attribute,
-               f"{task}_name": WRITTEN.get(kind, kind),
+               f"{task}_name": WRITTEN_NAMES.get(kind, kind),
                f"{task}_score": (float(labels.scores[k]) if np.isfinite(labels.scores[k])
                                  else NO_SCORE)}
     if task == "tracking" or track != NO_TRACK:
         columns["tracking_id"] = "" if track == NO_TRACK else names.get(track, str(track))
-    if rotation := rotation_read(labels, k, pose):
+    if rotation := find_read_rotation(labels, k, pose):
         columns["rotation"] = rotation
     extra.pop("rotation", None)
-    return {**beside(extra, OWN | columns.keys()), **columns}
+    return {**merge_extra(extra, OWN | columns.keys()), **columns}
 
 
-def _velocities(labels: DriveLabels, frames: Sequence[Frame],
-                poses: dict[int, np.ndarray]) -> dict[tuple[int, int], list[float]]:
-    """By frame and box: m/s in the fixed frame, of a track from the frame before to that after.
-    poses: of the frames with boxes."""
+def _compute_velocities(labels: DriveLabels, frames: Sequence[Frame],
+                        poses: dict[int, np.ndarray]) -> dict[tuple[int, int], list[float]]:
+    """Compute velocities in the fixed frame from the previous to the next box of a track.
+
+    Args:
+        poses: poses of the frames with boxes.
+
+    Returns:
+        Velocities [m/s] by frame and box.
+    """
     tracks: dict[tuple[str, int], list[tuple[int, int]]] = {}
     for i, (each, frame) in enumerate(zip(labels.frames, frames)):
         for k, track in enumerate(each.track_ids.tolist()):
             if track != NO_TRACK:
                 tracks.setdefault((frame.sequence, track), []).append((i, k))
-    found = {}
-    for places_ in tracks.values():
-        at = np.array([(poses[i] @ [*labels.frames[i].boxes[k, :3], 1.0])[:2]
-                       for i, k in places_])
-        seconds = np.array([frames[i].stamp_ns for i, _ in places_], np.int64)
-        for n, place in enumerate(places_):
-            first, last = max(n - 1, 0), min(n + 1, len(places_) - 1)
-            if (time := (seconds[last] - seconds[first]) * 1e-9) > 0:
-                found[place] = ((at[last] - at[first]) / time).tolist()
-    return found
+    velocities = {}
+    for boxes in tracks.values():
+        positions = np.array([(poses[i] @ [*labels.frames[i].boxes[k, :3], 1.0])[:2]
+                              for i, k in boxes])
+        stamps = np.array([frames[i].stamp_ns for i, _ in boxes], np.int64)
+        for n, box in enumerate(boxes):
+            first, last = max(n - 1, 0), min(n + 1, len(boxes) - 1)
+            if (seconds := (stamps[last] - stamps[first]) * 1e-9) > 0:
+                velocities[box] = ((positions[last] - positions[first]) / seconds).tolist()
+    return velocities
 
 
-detection, tracking = ((partial(_read, task), partial(_write, task))
-                       for task in ("detection", "tracking"))
+detection_format, tracking_format = ((partial(_read, task), partial(_write, task))
+                                     for task in ("detection", "tracking"))

@@ -1,7 +1,8 @@
-"""The parts of OpenLABEL files: coordinate systems, cuboids in them, and named values.
+"""Parts of OpenLABEL files: coordinate systems, cuboids in them, and named values.
 
-A system has a parent and its pose there (pose_wrt_parent), or a frame has a transform between two.
-A value is {"name": ..., "val": ...} in a list for its kind: num, text, boolean, vec.
+A coordinate system has a parent and its pose there (pose_wrt_parent), or a frame has a transform
+between two systems. A value is {"name": ..., "val": ...} in a list of its kind: num, text, boolean,
+vec.
 """
 
 from __future__ import annotations
@@ -19,29 +20,32 @@ from lidar_perception.data.nuscenes.boxes import to_matrices
 from lidar_perception.types import InputError
 
 LIDAR, CAMERA, FIXED = "lidar", "camera", "odom"
-LEAN = 1e-9  # of a box whose z axis is not up
+MAX_TILT = 1e-9  # 1 - cosine of the angle between the z axis of a box and the vertical
 
 
-def quaternion(yaw: float) -> list[float]:
-    """[qx qy qz qw] of a turn about z."""
+def yaw_to_quaternion(yaw: float) -> list[float]:
+    """Return the quaternion [qx qy qz qw] of a rotation about z."""
     return [0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)]
 
 
-def box_of(val: Sequence[float], to_lidar: np.ndarray) -> tuple[list[float], bool]:
+def cuboid_to_box(val: Sequence[float], to_lidar: np.ndarray) -> tuple[list[float], bool]:
     """Convert a cuboid to a box.
 
-    Args:
-        val: 10 numbers [x y z qx qy qz qw sx sy sz], or 9 with angles about x, y and z, the turn
-            about x first, instead of the quaternion.
-        to_lidar: (4, 4) from the cuboid's coordinate system to the LiDAR's.
-
-    Returns: [x y z l w h yaw] in the LiDAR's system, and whether the cuboid's z axis is up there.
     The height is the size along the axis that is closest to the vertical: y in a camera's system (x
-    right, y down, z ahead). Of the other two the first is the length, as in KITTI and ISO 8855.
+    right, y down, z ahead). The first of the other two is the length, as in KITTI and ISO 8855.
+
+    Args:
+        val: 10 numbers [x y z qx qy qz qw sx sy sz], or 9 with angles about x, y and z, applied in
+            this order, instead of the quaternion.
+        to_lidar: transform (4, 4) from the cuboid's coordinate system to the LiDAR's.
+
+    Returns:
+        [x y z l w h yaw] in the LiDAR's system, and True if the cuboid's z axis is up there.
     """
     if len(val) not in (9, 10):
-        raise ValueError(f"a cuboid of {len(val)} numbers, where it needs 10 or 9")
-    axes = to_lidar[:3, :3] @ (turned(val[3:7]) if len(val) == 10 else _turned(*val[3:6]))
+        raise ValueError(f"a cuboid has {len(val)} numbers instead of 10 or 9")
+    axes = to_lidar[:3, :3] @ (quaternion_to_matrix(val[3:7]) if len(val) == 10
+                               else _euler_to_matrix(*val[3:6]))
     x, y, z = (to_lidar[:3, :3] @ np.array(val[:3], float) + to_lidar[:3, 3]).tolist()
     up = 2 - int(np.abs(axes[2, ::-1]).argmax())
     ahead, across = (axis for axis in range(3) if axis != up)
@@ -51,41 +55,44 @@ def box_of(val: Sequence[float], to_lidar: np.ndarray) -> tuple[list[float], boo
     yaw = (yaw + math.pi) % (2 * math.pi) - math.pi if abs(yaw) > math.pi else yaw
     sizes = [float(size) for size in val[-3:]]
     return ([x, y, z, sizes[ahead], sizes[across], sizes[up], yaw],
-            bool(axes[2, 2] > 1 - LEAN))
+            bool(axes[2, 2] > 1 - MAX_TILT))
 
 
 def has_size(cuboid: dict[str, Any]) -> bool:
-    """Return False for a cuboid none of whose sizes is above 0, as KITTI's DontCare has them."""
+    """Return False for a cuboid without a positive size, such as KITTI's DontCare regions."""
     return not all(size <= 0 for size in cuboid["val"][-3:])
 
 
-def regions_of(data: dict[str, Any]) -> list[list[float]]:
-    """List the 2D boxes [left top right bottom] of an object's data, in pixels of the first camera
-    that is named."""
+def find_regions(data: dict[str, Any]) -> list[list[float]]:
+    """Return the 2D boxes [left top right bottom] of an object's data, in pixels of its first
+    camera."""
     boxes = [box for box in data.get("bbox", ()) if len(box["val"]) == 4]
     cameras = [box.get("coordinate_system") for box in boxes]
     return [[x - w / 2, y - h / 2, x + w / 2, y + h / 2] for box, camera in zip(boxes, cameras)
             if camera == cameras[0] for x, y, w, h in [map(float, box["val"])]]
 
 
-def turned(quaternion: Sequence[float]) -> np.ndarray:
-    """(3, 3) of [qx qy qz qw]."""
+def quaternion_to_matrix(quaternion: Sequence[float]) -> np.ndarray:
+    """Return the rotation matrix (3, 3) of [qx qy qz qw]."""
     return to_matrices(np.roll(np.array(quaternion, float).reshape(1, 4), 1))[0]
 
 
-def _turned(x: float, y: float, z: float) -> np.ndarray:
-    """(3, 3) of a turn about x, then one about y, then one about z."""
-    a, b, c = (turned([*(math.sin(angle / 2) * np.eye(3)[i]), math.cos(angle / 2)])
+def _euler_to_matrix(x: float, y: float, z: float) -> np.ndarray:
+    """Return the rotation matrix (3, 3) of a rotation about x, then about y, then about z."""
+    a, b, c = (quaternion_to_matrix([*(math.sin(angle / 2) * np.eye(3)[i]), math.cos(angle / 2)])
                for i, angle in enumerate((x, y, z)))
     return c @ b @ a
 
 
-def to_lidar(name: str, systems: dict[str, Any], frame: dict[str, Any], own: Frame,
-             where: str) -> np.ndarray:
-    """Return (4, 4) from the coordinate system of this name, "" for that of the LiDAR, by the poses
-    of systems and of the frame, or by the recording's own pose; from a camera of a file without a
-    LiDAR by the recording's calibration. InputError where they are not connected."""
-    lidar = lidar_of(systems, where)
+def find_transform_to_lidar(name: str, systems: dict[str, Any], frame: dict[str, Any], own: Frame,
+                            where: str) -> np.ndarray:
+    """Return the transform (4, 4) from a coordinate system ("" for the LiDAR's) to the LiDAR's.
+
+    It follows from the poses of the systems and of the frame, or else from the recording's pose.
+    For a camera in a file without a LiDAR, it follows from the recording's calibration. Raises
+    InputError if the systems are not connected.
+    """
+    lidar = find_lidar_system(systems, where)
     if name in ("", lidar):
         return np.eye(4)
     calibration = own.calibration() if _is_camera(name) and lidar not in systems else None
@@ -93,68 +100,73 @@ def to_lidar(name: str, systems: dict[str, Any], frame: dict[str, Any], own: Fra
         return np.linalg.inv(calibration.lidar_to_camera)
     roots = []
     for start in (name, lidar):
-        place, at = np.eye(4), start
+        transform, system = np.eye(4), start
         for _ in systems:
-            if at not in systems:
-                raise InputError(f"{where} does not define the coordinate system {at!r}, in which "
-                                 "it has a cuboid; write the file again")
-            if not (parent := systems[at].get("parent")):
+            if system not in systems:
+                raise InputError(f"{where} does not define the coordinate system {system!r} of a "
+                                 "cuboid; write the file again")
+            if not (parent := systems[system].get("parent")):
                 break
-            place, at = _pose(at, parent, systems, frame, own, where) @ place, parent
-        roots.append((at, place))
+            pose = _find_pose(system, parent, systems, frame, own, where)
+            transform, system = pose @ transform, parent
+        roots.append((system, transform))
     if roots[0][0] != roots[1][0]:
-        raise InputError(f"{where}: nothing says where {name!r} is from {lidar!r}")
+        raise InputError(f"{where}: the coordinate systems {name!r} and {lidar!r} are not "
+                         "connected; write the file again")
     return np.linalg.inv(roots[1][1]) @ roots[0][1]
 
 
-def lidar_of(systems: dict[str, Any], where: str) -> str:
-    """Return the name of the LiDAR's coordinate system. InputError if several may be it."""
+def find_lidar_system(systems: dict[str, Any], where: str) -> str:
+    """Return the name of the LiDAR's coordinate system. Raises InputError if it is ambiguous."""
     sensors = [name for name, s in systems.items()
                if s.get("type") == "sensor_cs" and not _is_camera(name)]
-    like = [name for name in sensors if any(word in name.lower() for word in
-                                            ("lidar", "velo", "laser"))] or sensors
-    if len(like) > 1:
-        raise InputError(f"{where} has several sensors that may be the LiDAR: {', '.join(like)}; "
-                         f"rename the right one to {LIDAR!r}, and give the others other names")
-    return like[0] if like else LIDAR
+    lidars = [name for name in sensors if any(word in name.lower() for word in
+                                              ("lidar", "velo", "laser"))] or sensors
+    if len(lidars) > 1:
+        raise InputError(f"{where} has several sensors that may be the LiDAR: {', '.join(lidars)}; "
+                         f"rename the right one to {LIDAR!r}, and the others to other names")
+    return lidars[0] if lidars else LIDAR
 
 
 def _is_camera(name: str) -> bool:
     return "cam" in name.lower()
 
 
-def _pose(name: str, parent: str, systems: dict[str, Any], frame: dict[str, Any], own: Frame,
-          where: str) -> np.ndarray:
+def _find_pose(name: str, parent: str, systems: dict[str, Any], frame: dict[str, Any], own: Frame,
+               where: str) -> np.ndarray:
     for transform in frame.get("frame_properties", {}).get("transforms", {}).values():
         if transform["src"] == name and transform["dst"] == parent:
-            return _matrix(transform["transform_src_to_dst"])
+            return _parse_transform(transform["transform_src_to_dst"])
     if "pose_wrt_parent" in systems[name]:
-        return _matrix(systems[name]["pose_wrt_parent"])
+        return _parse_transform(systems[name]["pose_wrt_parent"])
     pose = own.pose()
     if pose is None:
-        raise InputError(f"{where}: nothing says where {name!r} is in {parent!r} in frame "
-                         f"{own.index}")
+        raise InputError(f"{where}: the pose of {name!r} in {parent!r} is missing in frame "
+                         f"{own.index}; write the file again")
     return pose
 
 
-def _matrix(data: dict[str, Any]) -> np.ndarray:
+def _parse_transform(data: dict[str, Any]) -> np.ndarray:
     if "matrix4x4" in data:
         return np.array(data["matrix4x4"], float).reshape(4, 4)
     pose = np.eye(4)
-    pose[:3, :3] = turned(data["quaternion"])
+    pose[:3, :3] = quaternion_to_matrix(data["quaternion"])
     pose[:3, 3] = data["translation"]
     return pose
 
 
-def coordinate_systems(frames: Sequence[Frame]) -> dict[str, Any]:
-    """coordinate_systems and streams of a drive: the LiDAR's, and where they are known a fixed one
-    and the camera's."""
+def make_coordinate_systems(frames: Sequence[Frame]) -> dict[str, Any]:
+    """Return coordinate_systems and streams of a drive: the LiDAR's, a fixed one and the camera's.
+
+    The last two exist only if the recording has poses and a camera.
+    """
     calibration = frames[0].calibration() if frames else None
-    posed = bool(frames) and frames[0].pose() is not None
-    lidar: dict[str, Any] = {"type": "sensor_cs", "parent": FIXED if posed else "", "children": []}
+    has_poses = bool(frames) and frames[0].pose() is not None
+    lidar: dict[str, Any] = {"type": "sensor_cs", "parent": FIXED if has_poses else "",
+                             "children": []}
     systems: dict[str, Any] = {LIDAR: lidar}
     streams: dict[str, Any] = {LIDAR: {"type": "lidar"}}
-    if posed:
+    if has_poses:
         systems[FIXED] = {"type": "scene_cs", "parent": "", "children": [LIDAR]}
     if calibration is not None:
         pose = np.linalg.inv(calibration.lidar_to_camera)
@@ -167,26 +179,27 @@ def coordinate_systems(frames: Sequence[Frame]) -> dict[str, Any]:
     return {"coordinate_systems": systems, "streams": streams}
 
 
-def transforms(frame: Frame) -> dict[str, Any]:
-    """frame_properties of the pose of the LiDAR in a fixed frame, where there is one."""
+def make_transforms(frame: Frame) -> dict[str, Any]:
+    """Return frame_properties with the pose of the LiDAR in a fixed frame; empty without a pose."""
     pose = frame.pose()
     return {} if pose is None else {"transforms": {f"{LIDAR}_to_{FIXED}": {
         "src": LIDAR, "dst": FIXED,
         "transform_src_to_dst": {"matrix4x4": pose.ravel().tolist()}}}}
 
 
-def named(values: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """A JSON object as values with names, by kind; what is of no kind as text, NAME.json."""
-    found: dict[str, list[dict[str, Any]]] = {}
+def to_named_values(values: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """Convert a JSON object to named values by kind; values of other kinds become text
+    NAME.json."""
+    values_by_kind: dict[str, list[dict[str, Any]]] = {}
     for name, value in values.items():
         kind = next((kind for kind, fits in KINDS.items() if fits(value)), "")
-        found.setdefault(kind or "text", []).append(
+        values_by_kind.setdefault(kind or "text", []).append(
             {"name": name if kind else f"{name}.json", "val": value if kind else json.dumps(value)})
-    return found
+    return values_by_kind
 
 
-def from_named(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[Any]]]:
-    """The inverse of named(), and beside it what is no plain value, by kind."""
+def parse_named_values(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[Any]]]:
+    """Invert to_named_values; also return the items that are not plain values, by kind."""
     values: dict[str, Any] = {}
     rest: dict[str, list[Any]] = {}
     for kind, items in lists.items():
@@ -200,23 +213,23 @@ def from_named(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[An
     return values, rest
 
 
-def _number(value: Any) -> bool:
-    """Whether other readers have a number for it, too: they have no integers of 400 digits."""
+def _is_number(value: Any) -> bool:
+    """Return True for numbers that other readers can represent, unlike integers of 400 digits."""
     return (isinstance(value, int | float) and not isinstance(value, bool)
             and abs(value) <= sys.float_info.max)
 
 
-KINDS = {"boolean": lambda v: isinstance(v, bool), "num": _number,
+KINDS = {"boolean": lambda v: isinstance(v, bool), "num": _is_number,
          "text": lambda v: isinstance(v, str),
-         "vec": lambda v: isinstance(v, list) and len(v) > 0 and all(map(_number, v))}
+         "vec": lambda v: isinstance(v, list) and len(v) > 0 and all(map(_is_number, v))}
 
 
-def intervals(numbers: list[int]) -> list[dict[str, int]]:
-    """Runs of numbers without a gap."""
-    found: list[dict[str, int]] = []
+def find_intervals(numbers: list[int]) -> list[dict[str, int]]:
+    """Return the runs of consecutive numbers."""
+    runs: list[dict[str, int]] = []
     for number in sorted(set(numbers)):
-        if found and found[-1]["frame_end"] == number - 1:
-            found[-1]["frame_end"] = number
+        if runs and runs[-1]["frame_end"] == number - 1:
+            runs[-1]["frame_end"] = number
         else:
-            found.append({"frame_start": number, "frame_end": number})
-    return found
+            runs.append({"frame_start": number, "frame_end": number})
+    return runs

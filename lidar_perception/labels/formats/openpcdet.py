@@ -1,4 +1,4 @@
-"""Labels of OpenPCDet's custom data: one text file a frame, see data.openpcdet."""
+"""Labels of OpenPCDet's custom data: one text file per frame, see data.openpcdet."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from pathlib import Path
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.openpcdet import read_labels
-from lidar_perception.labels.drive_labels import DriveLabels, of_truth
-from lidar_perception.labels.formats.files import check_all_known, frame_files
+from lidar_perception.labels.drive_labels import DriveLabels, read_frame_labels
+from lidar_perception.labels.formats.files import check_label_files, list_frame_files
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a folder with FRAME.txt, or with labels/FRAME.txt. A frame without a file has no
-    labels."""
+    """Read a folder with FRAME.txt or labels/FRAME.txt. A frame without a file has no labels."""
     path = path / "labels" if (path / "labels").is_dir() else path
-    files = frame_files(path, frames, ".txt")
-    check_all_known(path, files, ".txt")
-    return DriveLabels([of_truth(replace(frame, truth=partial(read_labels, file)))
+    files = list_frame_files(path, frames, ".txt")
+    check_label_files(path, files, ".txt")
+    return DriveLabels([read_frame_labels(replace(frame, truth=partial(read_labels, file)))
                         for frame, file in zip(frames, files)])

@@ -1,8 +1,8 @@
-"""SUSTechPOINTS' JSON files, one a frame: position, scale and rotation of each box.
+"""SUSTechPOINTS' JSON files, one per frame: position, scale and rotation of each box.
 
-scale.x is along the length, which points to the front at rotation 0; rotations are in radians,
-about x, then the turned y, then the turned z, in the LiDAR's frame. Ids are text. Numbers are
-exact. SUSTechPOINTS forgets fields that are not its own when it saves.
+scale.x is along the length, which points to the front at rotation 0. Rotations are in radians,
+about x, then the rotated y, then the rotated z, in the LiDAR's frame. Ids are text. Numbers are
+exact. SUSTechPOINTS drops unknown fields when it saves.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from lidar_perception.labels.drive_labels import (
     DriveLabels,
     FrameLabels,
     Row,
-    ids_and_score,
-    of_rows,
-    unchanged,
+    get_id_and_score,
+    is_unchanged,
+    make_frame_labels,
 )
 from lidar_perception.labels.formats.files import (
-    beside,
-    check_all_known,
-    extra_of,
-    frame_files,
-    in_file,
+    assign_track_ids,
+    check_label_files,
+    collect_track_names,
+    extract_extra,
+    list_frame_files,
+    merge_extra,
     read_json,
-    track_names,
-    track_numbers,
+    report_format_errors,
     write_json,
 )
 from lidar_perception.runs.files import write_folder
@@ -42,35 +42,39 @@ OWN = {"psr", "obj_type", "obj_id", "score"}
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """path: a folder with FRAME.json, or that of a scene with label/. A frame without a file has no
-    labels."""
+    """Read a folder with FRAME.json, or that of a scene with label/.
+
+    A frame without a file has no labels.
+    """
     path = path / "label" if (path / "label").is_dir() else path
-    files = frame_files(path, frames, SUFFIX)
-    check_all_known(path, files, SUFFIX)
+    files = list_frame_files(path, frames, SUFFIX)
+    check_label_files(path, files, SUFFIX)
     contents = []
     for file in files:
         content = read_json(file) if file.exists() else []
-        # Later versions of the tool have the list inside of an object.
+        # Later versions of SUSTechPOINTS have the list inside an object.
         contents.append(content.get("objs", content) if isinstance(content, dict) else content)
-    ids = in_file(str(path), lambda: track_numbers({str(item.get("obj_id", ""))
-                                                    for c in contents for item in c} - {""}))
-    return DriveLabels([of_rows(frame, in_file(str(file), partial(_rows, content, ids)),
-                                where=file)
-                        for frame, file, content in zip(frames, files, contents)])
+    ids = report_format_errors(str(path), lambda: assign_track_ids(
+        {str(item.get("obj_id", "")) for content in contents for item in content} - {""}))
+    labels = []
+    for frame, file, content in zip(frames, files, contents):
+        rows = report_format_errors(str(file), partial(_parse_boxes, content, ids))
+        labels.append(make_frame_labels(frame, rows, where=file))
+    return DriveLabels(labels)
 
 
-def _rows(content: list[dict[str, Any]], ids: dict[str, int]) -> list[Row]:
+def _parse_boxes(content: list[dict[str, Any]], ids: dict[str, int]) -> list[Row]:
     rows: list[Row] = []
     for item in content:
-        position, scale, turns = ([float(item["psr"][part][axis]) for axis in "xyz"]
-                                  for part in ("position", "scale", "rotation"))
-        x, y, z = turns
+        position, scale, angles = ([float(item["psr"][part][axis]) for axis in "xyz"]
+                                   for part in ("position", "scale", "rotation"))
+        x, y, z = angles
         upright = x == y == 0
         yaw = z if upright else math.atan2(
             math.cos(x) * math.sin(z) + math.sin(x) * math.sin(y) * math.cos(z),
             math.cos(y) * math.cos(z))
         box = [*position, *scale, math.remainder(yaw, math.tau)]
-        extra = extra_of(item, OWN)
+        extra = extract_extra(item, OWN)
         if not upright:
             extra[TILTED] = {"rotation": item["psr"]["rotation"], "box": box}
         name = str(item.get("obj_id", ""))
@@ -83,22 +87,24 @@ def _rows(content: list[dict[str, Any]], ids: dict[str, int]) -> list[Row]:
 
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
-    """out: a folder, for FRAME.json of each frame."""
-    names = track_names(labels.frames, "obj_id")
+    """Write FRAME.json of each frame to the folder `out`."""
+    names = collect_track_names(labels.frames, "obj_id")
     with write_folder(out, force) as folder:
-        for each, file in zip(labels.frames, frame_files(folder, frames, SUFFIX)):
-            write_json(file, [_object(each, k, names) for k in range(len(each))], 1)
+        files = list_frame_files(folder, frames, SUFFIX)
+        for frame_labels, file in zip(labels.frames, files):
+            write_json(file, [_make_object(frame_labels, k, names)
+                              for k in range(len(frame_labels))], 1)
 
 
-def _object(labels: FrameLabels, k: int, names: dict[int, str]) -> dict[str, Any]:
+def _make_object(labels: FrameLabels, k: int, names: dict[int, str]) -> dict[str, Any]:
     box, extra = labels.boxes[k], dict(labels.extra[k])
-    known = ids_and_score(labels, k)
+    fields = get_id_and_score(labels, k)
     tilted, _ = extra.pop(TILTED, None), extra.pop("obj_id", None)
-    track = known.pop("track_id", "")
+    track = fields.pop("track_id", "")
     rotation = {"x": 0, "y": 0, "z": float(box[6])}
-    if tilted and unchanged(box, tilted["box"]):
+    if tilted and is_unchanged(box, tilted["box"]):
         rotation = tilted["rotation"]
     psr = {"position": dict(zip("xyz", box[:3].tolist())),
            "scale": dict(zip("xyz", box[3:6].tolist())), "rotation": rotation}
-    return {**beside(extra, OWN), "psr": psr, "obj_type": labels.class_names[k],
-            "obj_id": names.get(track, str(track)), **known}
+    return {**merge_extra(extra, OWN), "psr": psr, "obj_type": labels.class_names[k],
+            "obj_id": names.get(track, str(track)), **fields}
