@@ -77,17 +77,18 @@ def test_a_node_reads_dark_clouds_in_the_scale_of_its_stream():
     params = SimpleNamespace(input=InputParams(), crop=CropParams(), ground=GroundParams())
     placing = SimpleNamespace(level_frame=lambda frame: frame)
     transforms = SimpleNamespace(placing=lambda header: placing,
-                                 mounted=lambda params, placing: params)
+                                 with_mounting=lambda params, placing: params)
     node = SimpleNamespace(params=params, transforms=transforms, counts={})
     check, other = SensorCheck(node), SensorCheck(node)
     bright, dark = WHOLE[255], np.float32([0, 1, 1])
-    assert np.array_equal(check.frame(message(bright, 1), True)[0].intensity,
+    assert np.array_equal(check.read_frame(message(bright, 1), True)[0].intensity,
                           bright / np.float32(255))
-    assert np.array_equal(check.frame(message(dark, 2), True)[0].intensity, dark / np.float32(255))
-    assert np.array_equal(other.frame(message(dark, 2), True)[0].intensity, dark)
+    assert np.array_equal(check.read_frame(message(dark, 2), True)[0].intensity,
+                          dark / np.float32(255))
+    assert np.array_equal(other.read_frame(message(dark, 2), True)[0].intensity, dark)
     node.params.input = InputParams(intensity_max=2.0)
-    assert np.array_equal(check.frame(message(dark, 3), True)[0].intensity, dark / 2)
-    assert check.frame(message(dark, 4))[0].intensity is None  # no reader
+    assert np.array_equal(check.read_frame(message(dark, 3), True)[0].intensity, dark / 2)
+    assert check.read_frame(message(dark, 4))[0].intensity is None  # no reader
 
 
 @pytest.mark.parametrize("full", [100, 255, 1023, 4095, 65535])

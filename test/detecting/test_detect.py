@@ -300,7 +300,8 @@ def test_another_run_in_the_folder_is_refused_and_forced(kitti, tmp_path, monkey
     assert len(made) == 8 and not (out / "detections.csv").exists()
     assert not [*out.glob("kitti/*")] and len(objects(read_json(out))["000000"]) == 2
     write(tmp_path / "mine/letter.txt", "dear")
-    assert "has no run of this command" in refused(monkeypatch, capsys, kitti, "--out", tmp_path / "mine")
+    said = refused(monkeypatch, capsys, kitti, "--out", tmp_path / "mine")
+    assert "has no run of this command" in said
 
 
 # What cannot be used

@@ -303,7 +303,7 @@ def test_a_folder_is_read_in_order_without_unusable_returns(tmp_path):
 
 
 @pytest.mark.parametrize("root, file, content, text", [
-    ("nowhere", None, None, "there is no"), (".", None, None, "is no recording"),
+    ("nowhere", None, None, "does not exist"), (".", None, None, "is not a recording"),
     ("unlabelled", "velodyne/000000.bin", b"", "scans but no labels"),
     ("kitti", "velodyne/000001.bin", b"", "cannot read .*label"),
     ("kitti", "labels/000000.label", bytes(40), "has 10 labels for the 4402 points"),

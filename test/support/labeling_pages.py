@@ -140,7 +140,7 @@ class Label:
 @contextmanager
 def opened(browser, url: str, before: Callable = lambda page: None) -> Iterator:
     """A page at an address; before: what is done with it first."""
-    context = browser.create_context(viewport={"width": 1280, "height": 720})
+    context = browser.new_context(viewport={"width": 1280, "height": 720})
     page, wrong = context.new_page(), []
     page.set_default_timeout(60_000)
     page.on("pageerror", lambda error: wrong.append(error))
