@@ -45,8 +45,11 @@ def shared_segments(process: Path) -> set[Path]:
 def wait_for_stage(process: subprocess.Popen, stage: str, log: Path) -> None:
     """Wait until a starting node blocks signals, has loaded a library, or has logged a word."""
     proc, end = Path(f"/proc/{process.pid}"), monotonic() + LIMIT
-    while not (blocks_signals(proc) if stage == "blocked" else
-               stage in (proc / "maps").read_text() or stage in log.read_text()):
+    own = Path("/proc/self/cmdline").read_bytes()
+    # Between fork and exec the child has this process's libraries, and blocks all signals.
+    while (proc / "cmdline").read_bytes() == own or not (
+            blocks_signals(proc) if stage == "blocked" else
+            stage in (proc / "maps").read_text() or stage in log.read_text()):
         assert process.poll() is None and monotonic() < end, log.read_text()
         sleep(0.01)
 
