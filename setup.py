@@ -51,17 +51,19 @@ class WithDataFiles(Distribution):
     has_data = Distribution.has_data_files
 
 
+URL = repository_url()
+
 setup(
     distclass=WithDataFiles,
     name=NAME,
     version=VERSION,
     description="LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned "
                 "detectors, tracks, a simulator and training",
-    long_description=index_page((ROOT / "README.md").read_text(), repository_url()),
+    long_description=index_page((ROOT / "README.md").read_text(), URL),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
-    url=repository_url() or None,
-    project_urls=project_urls(repository_url()),
+    url=URL or None,
+    project_urls=project_urls(URL),
     maintainer="lidar_perception maintainers",
     keywords=["lidar", "point cloud", "3D object detection", "ROS 2", "PointPillars", "tracking",
               "KITTI", "ground segmentation", "clustering", "pedestrian detection"],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import subprocess
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ ROOT = DOCS.parent
 LINK = re.compile(r"\[([^\]]*)\]\(([^)\s#]+)(#[^)]*)?\)")
 
 
+@cache  # a page has many links
 def repository() -> str:
     """Return the https address of the repository that setup.py would write, or ""."""
     url = os.environ.get("LIDAR_REPOSITORY_URL", "")
