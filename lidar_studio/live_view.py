@@ -24,7 +24,7 @@ from lidar_studio.live import Live
 from lidar_studio.live_topics import box_topics, clouds_topic
 from msg_utils.detections import from_detection_array
 from msg_utils.markers import from_marker_array
-from msg_utils.messages import message_class
+from msg_utils.messages import load_message_class
 
 LOOK = 1.0    # seconds between looks at what there is
 ENDING = 5.0  # seconds for the message in hand
@@ -46,7 +46,7 @@ class LiveView(ExternalNode):
         if has_tf():
             for topic, qos in ((TF, TF_QOS), (TF_STATIC, STATIC_QOS)):
                 self.node.create_subscription(
-                    message_class(TF_MESSAGE), topic, self._taking(
+                    load_message_class(TF_MESSAGE), topic, self._taking(
                         topic, TF_MESSAGE, partial(add_transforms, live.tree,
                                                    static=topic == TF_STATIC)), qos, raw=True)
 
@@ -98,7 +98,7 @@ class LiveView(ExternalNode):
     def _open(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
         taking = self._taking(topic, kind, take)
         reception = self.receptions[topic] = Reception(
-            self.node, message_class(kind), topic, lambda data, patient: taking(data),
+            self.node, load_message_class(kind), topic, lambda data, patient: taking(data),
             lambda: RECEIVED, "cloud" if kind == CLOUD else "array")
         reception.open()
 

@@ -1,4 +1,4 @@
-"""Labelled boxes <-> vision_msgs/Detection3DArray, for stacks that have vision_msgs."""
+"""Conversion between labelled boxes and vision_msgs/Detection3DArray."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_utils.markers import MarkedObjects, box_pose, pose_yaw
+from msg_utils.markers import MarkedObjects, compute_yaw, make_box_pose
 from msg_utils.stamps import to_ns
 
 
@@ -15,15 +15,19 @@ def to_detection_array(boxes: np.ndarray, labels: Sequence[str],
                        scores: Sequence[float] | np.ndarray, *, header: Any, make: Any,
                        ids: Sequence[int] | np.ndarray | None = None,
                        covariances: np.ndarray | None = None) -> Any:
-    """Detection3DArray of boxes (K, 7) [x y z l w h yaw], one hypothesis each; ids as those of the
-    markers, by default 0..K-1. covariances (K, 6, 6) of x y z and the turns about them, metres and
-    radians; without any they are all zero: "unknown", as sensor_msgs/Imu has it."""
+    """Build a Detection3DArray of boxes (K, 7) [x y z l w h yaw], with one hypothesis each.
+
+    Args:
+        ids: K ids, as for markers; by default 0..K-1.
+        covariances: (K, 6, 6) of x, y, z and the rotations about them, in metres and radians; by
+            default all zero, which means "unknown", as in sensor_msgs/Imu.
+    """
     detections = []
     boxes = np.asarray(boxes, float).reshape(-1, 7)
     ids = range(len(boxes)) if ids is None else ids
     spread = np.zeros((len(boxes), 36)) if covariances is None else covariances.reshape(-1, 36)
     for i, box, label, score, square in zip(ids, boxes, labels, scores, spread, strict=True):
-        pose, (length, width, height) = box_pose(box, make), map(float, box[3:6])
+        pose, (length, width, height) = make_box_pose(box, make), map(float, box[3:6])
         hypothesis = make("vision_msgs/msg/ObjectHypothesis", class_id=label, score=float(score))
         detections.append(make(
             "vision_msgs/msg/Detection3D", header=header, id=str(int(i)),
@@ -36,13 +40,15 @@ def to_detection_array(boxes: np.ndarray, labels: Sequence[str],
 
 
 def from_detection_array(msg: Any) -> MarkedObjects:
-    """The objects of a Detection3DArray, each with its most likely class. Ids are those of the
-    message where all of them are numbers, each once; else 0..K-1, and the message's own, which may
-    be any text, are "id" in extras."""
+    """Return the objects of a Detection3DArray, each with its most likely class.
+
+    The ids are those of the message if all of them are unique numbers; else they are 0..K-1, and
+    the message's ids, which may be any text, are "id" in extras.
+    """
     boxes, labels, scores = [], [], []
     for d in msg.detections:
         p, s = d.bbox.center.position, d.bbox.size
-        boxes.append([p.x, p.y, p.z, s.x, s.y, s.z, pose_yaw(d.bbox.center)])
+        boxes.append([p.x, p.y, p.z, s.x, s.y, s.z, compute_yaw(d.bbox.center)])
         best = max(d.results, key=lambda r: r.hypothesis.score, default=None)
         labels.append(best.hypothesis.class_id if best else "")
         scores.append(best.hypothesis.score if best else 1.0)

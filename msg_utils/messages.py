@@ -1,4 +1,4 @@
-"""Message classes by name, from the ROS 2 installation."""
+"""Message classes of the ROS 2 installation, by name."""
 
 from __future__ import annotations
 
@@ -11,18 +11,24 @@ import numpy as np
 
 
 @functools.cache
-def message_class(type_name: str) -> type[Any]:
-    """'sensor_msgs/msg/PointCloud2' -> class. ModuleNotFoundError where ROS has no such package."""
+def load_message_class(type_name: str) -> type[Any]:
+    """Load a message class by name, such as 'sensor_msgs/msg/PointCloud2'.
+
+    Raises:
+        ModuleNotFoundError: if ROS has no such package.
+    """
     package, kind, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
 
 
-def ros_message(type_name: str, /, **fields: Any) -> Any:
-    """A message of ROS's own class; NumPy arrays become array.array, which its setters take as
-    they are instead of walking through them."""
+def make_ros_message(type_name: str, /, **fields: Any) -> Any:
+    """Make a message of ROS's class.
+
+    NumPy arrays are converted to array.array, which the setters take without checking each value.
+    """
     for name, value in fields.items():
         if isinstance(value, np.ndarray):
             values = array.array(value.dtype.char)
             values.frombytes(np.ascontiguousarray(value).data.cast("B"))
             fields[name] = values
-    return message_class(type_name)(**fields)
+    return load_message_class(type_name)(**fields)

@@ -1,5 +1,7 @@
-"""sensor_msgs/PointCloud2 <-> NumPy structured arrays: any field order, padding, datatype,
-count, endianness and row padding."""
+"""Conversion between sensor_msgs/PointCloud2 and NumPy structured arrays.
+
+Any field order, padding, datatype, count, byte order and row padding.
+"""
 
 from __future__ import annotations
 
@@ -10,18 +12,21 @@ import numpy as np
 # sensor_msgs/PointField datatypes
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 CODES = {kind: code for code, kind in DATATYPES.items()}
-MAX_STEP = 2**20  # bytes a point; NumPy's own limit is 2**31
+MAX_STEP = 2**20  # bytes per point; NumPy's limit is 2**31
 
 
 class CloudError(ValueError):
-    """A cloud that cannot be read. The message is one line: what is wrong, and the remedy."""
+    """A cloud cannot be read; the message is one line with the error and the remedy."""
 
 
-def dtype_of(msg: Any) -> np.dtype:
-    """The structured dtype of a cloud's points, itemsize = point_step, in the cloud's byte order.
+def compute_dtype(msg: Any) -> np.dtype:
+    """Return the structured dtype of a cloud's points, in the cloud's byte order.
 
-    Fields without a name are padding. CloudError for an unknown datatype, a field that reaches
-    past point_step, a name that comes twice, or a point_step above MAX_STEP.
+    Its itemsize is point_step. Fields without a name are padding.
+
+    Raises:
+        CloudError: for an unknown datatype, a field that reaches past point_step, a duplicate name,
+            or a point_step above MAX_STEP.
     """
     if msg.point_step > MAX_STEP:
         raise CloudError(f"point_step = {msg.point_step} is more than {MAX_STEP} bytes a point; "
@@ -35,7 +40,7 @@ def dtype_of(msg: Any) -> np.dtype:
             raise CloudError(f"field '{f.name}' has datatype {f.datatype}; "
                              "sensor_msgs/PointField knows 1 to 8")
         if f.name in names:
-            raise CloudError(f"field '{f.name}' comes twice; give each field its own name")
+            raise CloudError(f"field '{f.name}' exists twice; give each field a unique name")
         base = np.dtype(order + DATATYPES[f.datatype])
         names.append(f.name)
         formats.append((base, (f.count,)) if f.count > 1 else base)
@@ -47,19 +52,22 @@ def dtype_of(msg: Any) -> np.dtype:
 
 
 def to_array(msg: Any) -> np.ndarray:
-    """The points of a cloud, (height * width,) structured, row by row.
+    """Return the points of a cloud, (height * width,) structured, row by row.
 
-    A read-only view of the message's buffer; copied only where rows are padded. CloudError when
-    the buffer is shorter than height, width and the steps say. A row_step of 0, or one of the whole
-    cloud, as some drivers send it, counts as that of rows without padding.
+    The result is a read-only view of the message's buffer, or a copy if rows are padded. A row_step
+    of 0 or of the size of the whole cloud, as some drivers send it, means rows without padding.
+
+    Raises:
+        CloudError: if the buffer is too short for height, width and the steps.
     """
     count = msg.height * msg.width
     if count == 0:
-        return np.zeros(0, dtype_of(msg) if msg.point_step else np.dtype([]))
+        return np.zeros(0, compute_dtype(msg) if msg.point_step else np.dtype([]))
     if msg.point_step == 0:
         raise CloudError(f"point_step is 0 for {count} points; the message is broken")
-    dtype = dtype_of(msg)
-    data, row, step = np.frombuffer(msg.data, np.uint8), msg.width * msg.point_step, row_step(msg)
+    dtype = compute_dtype(msg)
+    data, row = np.frombuffer(msg.data, np.uint8), msg.width * msg.point_step
+    step = compute_row_step(msg)
     if step < row:
         raise CloudError(f"row_step = {step} is less than width x point_step = {row}")
     needed = (msg.height - 1) * step + row
@@ -72,18 +80,23 @@ def to_array(msg: Any) -> np.ndarray:
     return rows.reshape(count)
 
 
-def row_step(msg: Any) -> int:
-    """Return the bytes from one row of a cloud to the next, also where the message says 0 or the
-    size of all rows, though its data are those of rows without padding."""
+def compute_row_step(msg: Any) -> int:
+    """Return the number of bytes from one row of a cloud to the next.
+
+    A row_step of 0, or of the size of the whole cloud, means rows without padding.
+    """
     row, given = msg.width * msg.point_step, msg.row_step
     whole = msg.height * row
     complete = given == whole <= len(msg.data) < (msg.height - 1) * whole + row
     return int(row if msg.height <= 1 or given == 0 or complete else given)
 
 
-def columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """(N, len(names)) float32 of the named fields. CloudError names fields that are missing or
-    hold more than one number."""
+def read_columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    """Return (N, len(names)) float32 of the named fields.
+
+    Raises:
+        CloudError: naming a field that is missing or has more than one number.
+    """
     for name in names:
         if name not in (points.dtype.names or ()):
             raise CloudError(f"the cloud has no field '{name}'; it has "
@@ -97,10 +110,13 @@ def columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     return out
 
 
-def xyz(points: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 coordinates; invalid returns stay in. CloudError when x, y or z is missing
-    or is no floating-point field."""
-    out = columns(points, ("x", "y", "z"))
+def read_xyz(points: np.ndarray) -> np.ndarray:
+    """Return (N, 3) float32 coordinates, including invalid returns.
+
+    Raises:
+        CloudError: if x, y or z is missing or not a floating-point field.
+    """
+    out = read_columns(points, ("x", "y", "z"))
     for name in "xyz":
         if points.dtype[name].kind != "f":
             raise CloudError(f"field '{name}' is of type {points.dtype[name]}; metres as float32 "
@@ -110,20 +126,22 @@ def xyz(points: np.ndarray) -> np.ndarray:
 
 def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1,
                is_dense: bool = True) -> Any:
-    """PointCloud2 of a structured array (N,), whatever its layout; N must divide by height."""
+    """Build a PointCloud2 of a structured array (N,) of any layout; N is a multiple of height."""
     width = len(points) // height
     if width * height != len(points):
-        raise ValueError(f"{len(points)} points do not make {height} rows")
+        raise ValueError(f"{len(points)} points cannot be split into {height} rows")
     data = np.ascontiguousarray(points).view(np.uint8).reshape(-1)
     orders = {points.dtype[n].base.byteorder for n in points.dtype.names or ()} - {"|"}
     if len(orders) > 1:
-        raise ValueError("fields of both byte orders do not fit into one cloud")
-    return _cloud(header, make, point_fields(points.dtype, make), data, height=height, width=width,
-                  point_step=points.dtype.itemsize, is_bigendian=">" in orders, is_dense=is_dense)
+        raise ValueError("fields of both byte orders cannot be in one cloud")
+    return _make_cloud(header, make, make_point_fields(points.dtype, make), data, height=height,
+                       width=width,
+                       point_step=points.dtype.itemsize, is_bigendian=">" in orders,
+                       is_dense=is_dense)
 
 
-def point_fields(dtype: np.dtype, make: Any) -> list[Any]:
-    """PointField messages of a structured dtype."""
+def make_point_fields(dtype: np.dtype, make: Any) -> list[Any]:
+    """Build the PointField messages of a structured dtype."""
     fields = []
     for name, (kind, offset, *_) in (dtype.fields or {}).items():
         code = CODES.get(f"{kind.base.kind}{kind.base.itemsize}")
@@ -135,10 +153,10 @@ def point_fields(dtype: np.dtype, make: Any) -> list[Any]:
 
 
 def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
-    """The same cloud with further fields, each (height * width,) of a PointField datatype.
+    """Return the cloud with further fields, each (height * width,) of a PointField datatype.
 
-    Every old field keeps its bytes; a new one lies at a multiple of its size. A field that exists
-    already with the same datatype is overwritten. Shape, density and byte order stay as they are.
+    Existing fields keep their bytes; the offset of a new one is a multiple of its size. A field
+    that exists with the same datatype is overwritten. Shape, density and byte order do not change.
     """
     old = to_array(msg)
     order: Literal[">", "<"] = ">" if msg.is_bigendian else "<"
@@ -153,28 +171,30 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
             places[name] = (known.offset, kind)
             continue
         fields = [f for f in fields if f.name != name]
-        offset = -(-offset // kind.itemsize) * kind.itemsize  # as C structs have it
+        offset = -(-offset // kind.itemsize) * kind.itemsize  # aligned as in C structs
         fields.append(make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=code,
                            count=1))
         places[name] = (offset, kind)
         offset += kind.itemsize
-    # 4-byte steps keep float fields aligned in every point
+    # A step that is a multiple of 4 bytes keeps float fields aligned in every point.
     step = offset if offset == msg.point_step else -(-offset // 4) * 4
     data = np.zeros((len(old), step), np.uint8)
     if len(old):
         raw = np.frombuffer(msg.data, np.uint8)
-        if (step_in := row_step(msg)) != msg.width * msg.point_step:
+        if (step_in := compute_row_step(msg)) != msg.width * msg.point_step:
             raw = np.ndarray((msg.height, msg.width * msg.point_step), np.uint8, raw,
                              strides=(step_in, 1)).reshape(-1)
         data[:, :msg.point_step] = raw[:len(old) * msg.point_step].reshape(-1, msg.point_step)
         for name, (at, kind) in places.items():
             np.ndarray(len(old), kind, data, offset=at, strides=(step,))[:] = new[name]
-    return _cloud(msg.header, make, fields, data.reshape(-1), height=msg.height, width=msg.width,
-                  point_step=step, is_bigendian=msg.is_bigendian, is_dense=msg.is_dense)
+    return _make_cloud(msg.header, make, fields, data.reshape(-1), height=msg.height,
+                       width=msg.width,
+                       point_step=step, is_bigendian=msg.is_bigendian, is_dense=msg.is_dense)
 
 
-def _cloud(header: Any, make: Any, fields: list[Any], data: np.ndarray, *, height: int, width: int,
-           point_step: int, is_bigendian: bool, is_dense: bool) -> Any:
+def _make_cloud(header: Any, make: Any, fields: list[Any], data: np.ndarray, *, height: int,
+                width: int,
+                point_step: int, is_bigendian: bool, is_dense: bool) -> Any:
     return make("sensor_msgs/msg/PointCloud2", header=header, height=height, width=width,
                 fields=fields, is_bigendian=is_bigendian, point_step=point_step,
                 row_step=width * point_step if data.size else 0, data=data, is_dense=is_dense)

@@ -20,7 +20,7 @@ from lidar_perception.intensity import (
 )
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.robot.params import CropParams
-from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections, InputError, PointCloud
 from lidar_perception.wire.params import InputParams
@@ -72,7 +72,7 @@ def test_the_scale_of_a_stream_never_falls(order):
 def test_a_node_reads_dark_clouds_in_the_scale_of_its_stream():
     """The scale of one node does not affect another node."""
     def message(values, stamp):
-        return cloud_message(np.column_stack([np.ones((len(values), 3)), values]), stamp)
+        return make_cloud_message(np.column_stack([np.ones((len(values), 3)), values]), stamp)
 
     params = SimpleNamespace(input=InputParams(), crop=CropParams(), ground=GroundParams())
     placing = SimpleNamespace(level_frame=lambda frame: frame)

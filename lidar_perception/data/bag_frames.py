@@ -48,7 +48,7 @@ from lidar_perception.wire.messages import (
 )
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, INSTANCE, POINTS, SEMANTIC, TRUTH
 from msg_utils.markers import from_marker_array
-from msg_utils.stamps import SECOND
+from msg_utils.stamps import SECOND_NS
 
 # Topics that a bag needs for each kind of content
 TOPICS_BY_CONTENT = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}}
@@ -298,7 +298,7 @@ def _read_header_stamp(data: bytes) -> int | None:
     if len(data) < 12:
         return None
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
-    return int(seconds * SECOND + nanoseconds)
+    return int(seconds * SECOND_NS + nanoseconds)
 
 
 def _read_frame_id(data: bytes) -> str:

@@ -18,8 +18,8 @@ from lidar_perception.runs.files import check_regular, shorten_error
 from lidar_perception.types import MAX_RANGE, InputError, PointCloud
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import read_raw_intensity, to_point_cloud
-from msg_utils.point_cloud2 import from_array, xyz
-from msg_utils.stamps import header_message
+from msg_utils.point_cloud2 import from_array, read_xyz
+from msg_utils.stamps import make_header
 
 KITTI = "x y z intensity"
 MAX_COLUMNS = 16  # of a .npy file; an array with more is probably transposed
@@ -65,7 +65,7 @@ def check_range(points: np.ndarray, where: object) -> None:
 
     `where` names the cloud in the message.
     """
-    coordinates = xyz(points)
+    coordinates = read_xyz(points)
     far = np.abs(coordinates[np.isfinite(coordinates).all(axis=1)]).max(axis=1, initial=0)
     if len(far) and far.min() > MAX_RANGE / 2:
         x, y = (round(float(points[axis][0]), -3) for axis in "xy")
@@ -81,7 +81,7 @@ def to_message(file: Path, stamp_ns: int = 0, frame_id: str = "") -> Any:
     kinds = [(name, points.dtype[name].base.str.replace("i8", "f8").replace("u8", "f8"),
               points.dtype[name].shape) for name in points.dtype.names or ()]
     try:
-        return from_array(points.astype(kinds), header_message(stamp_ns, frame_id, bag_message),
+        return from_array(points.astype(kinds), make_header(stamp_ns, frame_id, bag_message),
                           bag_message)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None

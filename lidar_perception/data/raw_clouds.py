@@ -21,7 +21,7 @@ from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.topics import LIDAR_FRAME
 from msg_utils.point_cloud2 import from_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 PAIR_DISTANCE = 8  # between the clouds of every second pair, see choose_clouds
 
@@ -90,7 +90,7 @@ def _open_files(path: Path, files: list[Path]) -> RawClouds:
 
 def _to_message(frame: Frame) -> Any:
     scan = frame.load()
-    header = header_message(scan.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
+    header = make_header(scan.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
     return from_array(to_point_array(scan), header, bag_message)
 
 

@@ -35,9 +35,9 @@ from lidar_perception.wire.topics import (
     TRUTH_3D,
 )
 from msg_utils.detections import to_detection_array
-from msg_utils.markers import from_marker_array, marker_keys
+from msg_utils.markers import from_marker_array, list_marker_keys
 from msg_utils.point_cloud2 import from_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 DETECTIONS_3D = "vision_msgs/msg/Detection3DArray"
@@ -121,7 +121,7 @@ class FrameWriter:
         if truth is not None and frame.stamp_ns in self._labelled:
             raise InputError(f"{frame.name}: another labelled scan has the same stamp, so labels "
                              "could not be assigned to scans")
-        header = header_message(frame.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
+        header = make_header(frame.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
         image = frame.image if self.images and frame.image and frame.image.exists() else None
         return FrameContent(header, frame.stamp_ns, calibration, pose, truth, image,
                             to_point_array(scan, columns) if self.clouds else None)
@@ -137,7 +137,7 @@ class FrameWriter:
         if truth is not None:
             self._labelled.add(stamp_ns)
             markers = make_truth_markers(truth, header, bag_message, self._shown)
-            self._shown = marker_keys(markers)
+            self._shown = list_marker_keys(markers)
             bag.write(TRUTH, stamp_ns, markers)
             if self.detections_3d:
                 bag.write(TRUTH_3D, stamp_ns, _make_detections(markers, header))
@@ -173,7 +173,7 @@ def _make_detections(markers: Any, header: Any) -> Any:
 def _write_image(bag: BagWriter, image: Path, stamp_ns: int) -> None:
     if IMAGE not in bag.channels:
         bag.add_topic(IMAGE, "sensor_msgs/msg/CompressedImage")
-    header = header_message(stamp_ns, CAMERA_FRAME, bag_message)
+    header = make_header(stamp_ns, CAMERA_FRAME, bag_message)
     bag.write(IMAGE, stamp_ns, bag_message("sensor_msgs/msg/CompressedImage", header=header,
                                            format="png", data=np.fromfile(image, np.uint8)))
 
@@ -181,13 +181,13 @@ def _write_image(bag: BagWriter, image: Path, stamp_ns: int) -> None:
 def _write_pose(bag: BagWriter, pose: np.ndarray, stamp_ns: int, frame_id: str) -> None:
     if ODOMETRY not in bag.channels:
         bag.add_topic(ODOMETRY, "nav_msgs/msg/Odometry")
-    fixed = header_message(stamp_ns, ODOMETRY_FRAME, bag_message)
+    fixed = make_header(stamp_ns, ODOMETRY_FRAME, bag_message)
     bag.write(ODOMETRY, stamp_ns, make_odometry(pose, fixed, frame_id, bag_message))
 
 
 def _write_calibration(bag: BagWriter, calibration: Calibration, stamp_ns: int,
                        header) -> None:
-    camera_header = header_message(stamp_ns, CAMERA_FRAME, bag_message)
+    camera_header = make_header(stamp_ns, CAMERA_FRAME, bag_message)
     transform = make_extrinsics(calibration, header, bag_message)
     bag.write(CAMERA_INFO, stamp_ns, make_camera_info(calibration, camera_header, bag_message))
     bag.write(EXTRINSICS, stamp_ns, transform)

@@ -18,7 +18,7 @@ from lidar_perception.wire.messages import make_detection_markers
 from lidar_perception.wire.topics import FOUND, TRACKS
 from lidar_perception.wire.track_markers import make_track_markers
 from msg_utils.detections import to_detection_array
-from msg_utils.markers import marker_keys
+from msg_utils.markers import list_marker_keys
 
 
 class Bag:
@@ -73,7 +73,7 @@ class Bag:
         self.writer.write(content)
 
     def _write(self, topic: str, stamp_ns: int, markers: Any) -> None:
-        self._shown[topic] = marker_keys(markers)
+        self._shown[topic] = list_marker_keys(markers)
         self.bag.write(topic, stamp_ns, markers)
 
     def _write_3d(self, topic: str, stamp_ns: int, header: Any, found: Detections,

@@ -16,15 +16,15 @@ from lidar_perception.tracking.ego import NO_SOURCE, Odometry, best_source, has_
 from lidar_perception.tracking.params import EgoParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import to_point_cloud
-from msg_utils.stamps import SECOND, to_ns
+from msg_utils.stamps import SECOND_NS, to_ns
 
 START, SCAN = "start", "scan"  # frames of KISS-ICP
 ICP_MS = "kiss_icp_cpu_ms_median"
 PAUSE_S = 1.0            # without waiting, after waiting for a pose has timed out
-GRACE_NS = SECOND        # without a pose, before ego.source auto uses the scans
+GRACE_NS = SECOND_NS        # without a pose, before ego.source auto uses the scans
 TIMED_SCANS = 100        # for the median time of KISS-ICP
 ODOMETRY_TIMEOUT_S = 2.0
-MAX_OFFSET_NS = 10 * SECOND  # a larger offset of odometry and detections means different clocks
+MAX_OFFSET_NS = 10 * SECOND_NS  # a larger offset of odometry and detections means different clocks
 
 
 class EgoInput:
@@ -110,11 +110,11 @@ class EgoInput:
         if self.source == "odometry" and last is not None:
             topic = self.node.resolve_topic_name("~/input/odometry")
             silent = monotonic() - self.transforms.odometry_arrival
-            if silent > ODOMETRY_TIMEOUT_S and stamp - last > self.params().max_gap * SECOND:
+            if silent > ODOMETRY_TIMEOUT_S and stamp - last > self.params().max_gap * SECOND_NS:
                 return (f"no odometry on {topic} for {silent:.0f} s: the sensor is assumed to "
                         "stand; is the odometry running?")
             if silent <= ODOMETRY_TIMEOUT_S and abs(last - stamp) > MAX_OFFSET_NS:
-                return (f"the odometry on {topic} is stamped {abs(last - stamp) / SECOND:.0f} s "
+                return (f"the odometry on {topic} is stamped {abs(last - stamp) / SECOND_NS:.0f} s "
                         f"{'ahead of' if last > stamp else 'behind'} the detections, so none of "
                         "its poses is used: do both use the same clock (use_sim_time)?")
         if wanted == "tf" and self.source != "tf":
@@ -222,7 +222,7 @@ class EgoInput:
         stamp_ns = to_ns(header.stamp)
         if self.scan_ns - JUMP_NS <= stamp_ns <= self.scan_ns:
             return  # repeated or late; the tracker rejects and reports it
-        gap = (stamp_ns - self.scan_ns) / SECOND
+        gap = (stamp_ns - self.scan_ns) / SECOND_NS
         if not 0 < gap <= 2 * self.params().max_gap:  # the map is of another place or time
             self.icp, self.scans = Odometry(), TransformTree()
             self.icp_restarts += 1

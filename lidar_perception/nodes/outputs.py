@@ -24,9 +24,9 @@ from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import make_detection_markers, make_xyz_cloud
 from msg_utils.detections import to_detection_array
-from msg_utils.markers import marker_keys, to_marker_array
-from msg_utils.messages import message_class, ros_message
-from msg_utils.stamps import header_message, to_ns
+from msg_utils.markers import list_marker_keys, to_marker_array
+from msg_utils.messages import load_message_class, make_ros_message
+from msg_utils.stamps import make_header, to_ns
 
 
 def to_output_frame(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[Any, np.ndarray]:
@@ -37,7 +37,7 @@ def to_output_frame(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[An
     """
     placing = node.transforms.placing(header)
     if placing.frame_id != header.frame_id:
-        header = header_message(to_ns(header.stamp), placing.frame_id, bag_message)
+        header = make_header(to_ns(header.stamp), placing.frame_id, bag_message)
     return header, boxes if placing.out is None else transform_boxes(boxes, placing.out)
 
 
@@ -57,7 +57,7 @@ class ClusterBoxes:
                                       make=bag_message, ids=ids, previous=self.marker_keys,
                                       lifetime_ns=find_marker_lifetime_ns(self.node),
                                       extras=_marker_texts(output, ids))
-            self.marker_keys = marker_keys(markers)
+            self.marker_keys = list_marker_keys(markers)
             self.publisher.publish(encode(markers))
 
 
@@ -108,7 +108,7 @@ class DetectionMarkers:
         """Publish detections that are in the frame of the header."""
         message = make_detection_markers(detections, header, bag_message, self.marker_keys,
                                          find_marker_lifetime_ns(self.node), clusters)
-        self.marker_keys = marker_keys(message)
+        self.marker_keys = list_marker_keys(message)
         self.publisher.publish(encode(message))
 
 
@@ -122,7 +122,7 @@ class DetectionOutputs:
         self.detections_3d = None
         if has_detections_3d():
             self.detections_3d = node.create_publisher(
-                message_class(DETECTIONS_3D), "~/output/detections_3d", RELIABLE)
+                load_message_class(DETECTIONS_3D), "~/output/detections_3d", RELIABLE)
         self.step_times = {step: node.create_publisher(Float64, f"~/debug/{step}_ms", RELIABLE)
                            for step in steps}
         self.tracks = (TrackOutputs(node, lambda: node.node_params, clouds=True)
@@ -151,8 +151,8 @@ class DetectionOutputs:
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
             self.detections_3d.publish(to_detection_array(
                 detections.boxes, [CLASSES[i] for i in detections.class_ids], detections.scores,
-                make=ros_message,
-                header=header_message(to_ns(header.stamp), header.frame_id, ros_message)))
+                make=make_ros_message,
+                header=make_header(to_ns(header.stamp), header.frame_id, make_ros_message)))
         for step, publisher in self.step_times.items():
             if step in ms:
                 publisher.publish(Float64(data=ms[step]))

@@ -34,7 +34,7 @@ from lidar_perception.nodes.reception import Problem, Reception
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.types import InputError, closest_name
 from lidar_perception.wire.codec import bag_message, decode, encode, load_typestore
-from msg_utils.messages import message_class
+from msg_utils.messages import load_message_class
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 MARKERS = "visualization_msgs/msg/MarkerArray"
@@ -166,7 +166,7 @@ class LidarNode(Node):
             return missing
 
         untyped_receive: Any = receive  # the annotation of rclpy has no result
-        kind, what = message_class(type_name), "cloud" if type_name == CLOUD else "array"
+        kind, what = load_message_class(type_name), "cloud" if type_name == CLOUD else "array"
 
         def report_incompatible(event: Any) -> None:
             if len(qos) > 1:
@@ -204,7 +204,7 @@ class LidarNode(Node):
         name = topic if topic[0] in "~/" else f"~/output/{topic}"
         _warm_up_type(type_name)
         publisher = self.create_publisher(
-            message_class(type_name), name, qos,
+            load_message_class(type_name), name, qos,
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         self._outputs.append(publisher)
         return publisher
@@ -328,7 +328,7 @@ def decode_message(data: bytes, type_name: str) -> Any:
     """Decode CDR to the class of rosbags, or of rclpy for types that rosbags does not know."""
     if type_name in load_typestore().fielddefs:
         return decode(data, type_name)
-    return deserialize_message(data, message_class(type_name))
+    return deserialize_message(data, load_message_class(type_name))
 
 
 class MessageInput:

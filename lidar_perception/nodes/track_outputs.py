@@ -20,9 +20,9 @@ from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.track_markers import make_track_markers
 from msg_utils.detections import to_detection_array
-from msg_utils.markers import marker_keys
-from msg_utils.messages import message_class, ros_message
-from msg_utils.stamps import SECOND, header_message, to_ns
+from msg_utils.markers import list_marker_keys
+from msg_utils.messages import load_message_class, make_ros_message
+from msg_utils.stamps import SECOND_NS, make_header, to_ns
 
 DETECTIONS_3D = "vision_msgs/msg/Detection3DArray"
 MIN_LIFETIME_PERIODS = 2.5  # lifetime of markers in periods of the input
@@ -49,7 +49,7 @@ class TrackOutputs:
         self.frame_id: str | None = None
         self.marker_keys: Any = ()
         self.markers = node.output("tracks", MARKERS)
-        self.array = node.create_publisher(message_class(DETECTIONS_3D), "~/output/tracks_3d",
+        self.array = node.create_publisher(load_message_class(DETECTIONS_3D), "~/output/tracks_3d",
                                            RELIABLE) if has_detections_3d() else None
         self.count_history: deque[tuple[float, int, int]] = deque()  # seconds, born, ended
 
@@ -97,14 +97,14 @@ class TrackOutputs:
             bag_message, previous=self.marker_keys, lifetime_ns=find_marker_lifetime_ns(self.node),
             extras=[{"seen": bool(seen), "age": round(float(age), 3)}
                     for seen, age in zip(tracks.seen, tracks.ages)])
-        self.marker_keys = marker_keys(message)
+        self.marker_keys = list_marker_keys(message)
         self.markers.publish(encode(message))
         if self.array is not None and self.array.get_subscription_count():
             detections = tracks.detections
             self.array.publish(to_detection_array(
                 detections.boxes, [CLASSES[i] for i in detections.class_ids], detections.scores,
-                ids=tracks.ids, covariances=tracks.pose_covariances(), make=ros_message,
-                header=header_message(stamp, header.frame_id, ros_message)))
+                ids=tracks.ids, covariances=tracks.pose_covariances(), make=make_ros_message,
+                header=make_header(stamp, header.frame_id, make_ros_message)))
 
     def _count(self, stamp: int, reported: int) -> None:
         tracker, now = self.tracker, stamp / 1e9
@@ -131,7 +131,7 @@ def find_marker_lifetime_ns(node: LidarNode) -> int:
              if (rate := reception.expected_rate())]
     if seconds and rates:
         seconds = max(seconds, min(MIN_LIFETIME_PERIODS / min(rates), MAX_LIFETIME_S))
-    return int(seconds * SECOND)
+    return int(seconds * SECOND_NS)
 
 
 def has_detections_3d() -> bool:

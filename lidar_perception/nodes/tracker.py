@@ -12,7 +12,7 @@ from lidar_perception.params import TrackerNodeParams, TrackInputParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import find_unknown_classes, to_detections
 from msg_utils.detections import from_detection_array
-from msg_utils.markers import MarkedObjects, array_header, from_marker_array
+from msg_utils.markers import MarkedObjects, find_header, from_marker_array
 from msg_utils.stamps import to_ns
 
 
@@ -37,13 +37,13 @@ class TrackerNode(ManagedNode):
                        needs=lambda m: self.tracks.ego.find_missing_pose(m.header))
 
     def _find_missing_pose(self, msg: Any) -> str | None:
-        return self.tracks.ego.find_missing_pose(array_header(msg)) if msg.markers else None
+        return self.tracks.ego.find_missing_pose(find_header(msg)) if msg.markers else None
 
     def on_markers(self, msg: Any) -> None:
         if not msg.markers:
             raise InputError("ignored an array without a marker, which has no stamp; send a "
                              "DELETEALL with the header of the frame")
-        self._track(array_header(msg), from_marker_array(msg))
+        self._track(find_header(msg), from_marker_array(msg))
 
     def on_detections(self, msg: Any) -> None:
         self._track(msg.header, from_detection_array(msg))

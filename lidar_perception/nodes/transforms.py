@@ -35,7 +35,7 @@ from lidar_perception.wire.transforms import (
     add_odometry,
     add_transforms,
 )
-from msg_utils.stamps import SECOND, to_ns
+from msg_utils.stamps import SECOND_NS, to_ns
 
 TF_QOS = QoSProfile(depth=100)
 STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -150,8 +150,8 @@ class Transforms:
             for frame in filter(None, (self.base_frame, self.target_frame)):
                 self._require_connection(frame, frame_id, stamp)
             if self.node.node_params.input.deskew != "off":
-                self.sensor_poses(self.node.node_params.input.deskew, frame_id,
-                                  np.array([stamp + round(self._sweep_duration(cloud) * SECOND)]))
+                end = stamp + round(self._sweep_duration(cloud) * SECOND_NS)
+                self.sensor_poses(self.node.node_params.input.deskew, frame_id, np.array([end]))
         except MissingTransform as error:
             return str(error) if error.late else None
         return None
@@ -377,7 +377,7 @@ class Transforms:
 
         def poses(at: np.ndarray) -> np.ndarray:
             # Set before the lookup: after a failure, the next cloud waits for the end of its sweep.
-            self.sweep = float(at.max() - frame.stamp_ns) / SECOND
+            self.sweep = float(at.max() - frame.stamp_ns) / SECOND_NS
             return self.sensor_poses(self.node.node_params.input.deskew, frame.frame_id, at)
 
         result = deskew_points(msg, frame, indices, poses)

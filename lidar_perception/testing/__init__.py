@@ -1,21 +1,21 @@
-"""For tests of stacks that use this package: bags, running nodes, waiting, and what was detected.
+"""pytest plugin for stacks that use this package: bags, running nodes, waiting, and assertions.
 
     pytest_plugins = ["lidar_perception.testing"]           # in conftest.py
 
-    def test_a_pedestrian_is_found(peer, processes, make_bag):
+    def test_pedestrian_is_detected(peer, processes, make_bag):
         processes.start_graph(["pointpillars"])             # or start(node), or run(your program)
         found = peer.listen("/pointpillars_detector/output/detections", MARKERS)
         processes.play(make_bag([cloud], [[("Pedestrian", box)]]))
         peer.wait(lambda: found, "detections")
         assert_detections(found[-1], [("Pedestrian", box)])
 
-Fixtures: `peer`, a node of the test's own; `processes`, whose logs are shown when a test fails;
-`shared_peer` and `shared_processes`, for all tests of a module; `domain`, a ROS domain that nobody
-else uses; `make_bag` and `drive_bag`. Functions: `detections.assert_detections`, `bags.recording`,
-and `launching` for launch_testing. docs/how-to/test-your-stack.md has a whole test.
+Fixtures: `peer`, a node in the test process; `processes`, whose logs are shown when a test fails;
+`shared_peer` and `shared_processes`, for all tests of a module; `domain`, a private ROS domain;
+`make_bag` and `drive_bag`. Functions: `detections.assert_detections`, `bags.make_frames`, and
+`launching` for launch_testing. docs/how-to/test-your-stack.md has a complete test.
 
-There is no entry point: whoever does not name this plugin does not load it. To load it takes pytest
-and the standard library; ROS is imported by the fixtures that need it.
+The plugin has no entry point, so pytest loads it only if it is named. It needs pytest and the
+standard library; fixtures import ROS when they need it.
 """
 
 from lidar_perception.testing.fixtures import (

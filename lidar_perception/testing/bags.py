@@ -1,4 +1,4 @@
-"""Bags for tests, of arrays or of simulated frames, in the bytes of another program: rosbags."""
+"""Bags for tests, made of arrays or simulated frames and written by the rosbags library."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.testing.detections import objects_of
+from lidar_perception.testing.detections import to_objects
 from lidar_perception.types import CLASSES, GroundTruth, InputError, PointCloud
 from lidar_perception.wire.codec import load_typestore
 from lidar_perception.wire.topics import LIDAR_FRAME
@@ -22,14 +22,21 @@ START_NS = 1_700_000_000 * 10**9
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 
 
-def recording(clouds: Iterable[Any], labels: Iterable[Any] | None = None, *,
-              frame_id: str = LIDAR_FRAME, hz: float = 10.0, start_ns: int = START_NS
-              ) -> list[Frame]:
-    """Frames of clouds (N, 3) [x y z] metres or (N, 4) with the intensity 0..1, in the sensor's
-    frame. labels: for each cloud GroundTruth, pairs (class name, [x y z l w h yaw]), or None for a
-    cloud that has none. InputError for arrays of another shape, or of another number."""
+def make_frames(clouds: Iterable[Any], labels: Iterable[Any] | None = None, *,
+                frame_id: str = LIDAR_FRAME, hz: float = 10.0, start_ns: int = START_NS
+                ) -> list[Frame]:
+    """Make frames of clouds.
+
+    Args:
+        clouds: arrays (N, 3) [x y z] in metres, or (N, 4) with intensity 0..1, in the sensor frame.
+        labels: for each cloud GroundTruth, pairs (class name, [x y z l w h yaw]), or None for an
+            unlabelled cloud.
+
+    Raises:
+        InputError: for arrays of another shape, or if the numbers of clouds and labels differ.
+    """
     clouds = [np.asarray(cloud, np.float32) for cloud in clouds]
-    truths = [None] * len(clouds) if labels is None else [*map(_truth, labels)]
+    truths = [None] * len(clouds) if labels is None else [*map(_to_truth, labels)]
     if len(truths) != len(clouds):
         raise InputError(f"{len(clouds)} clouds and labels of {len(truths)}; give one each")
     frames = []
@@ -43,28 +50,35 @@ def recording(clouds: Iterable[Any], labels: Iterable[Any] | None = None, *,
     return frames
 
 
-def _truth(given: Any) -> GroundTruth | None:
+def _to_truth(given: Any) -> GroundTruth | None:
     if given is None or isinstance(given, GroundTruth):
         return given
-    objects = objects_of(given)
+    objects = to_objects(given)
     if unknown := [name for name in objects.labels if name not in CLASSES]:
         raise InputError(f"labels: '{unknown[0]}' is none of {', '.join(CLASSES)}")
     if np.isnan(objects.boxes).any():
-        raise InputError("labels need whole boxes [x y z l w h yaw]")
+        raise InputError("labels need complete boxes [x y z l w h yaw]")
     return GroundTruth.of(objects.boxes, [CLASSES.index(name) for name in objects.labels])
 
 
-def bag_of(path: Path, frames: Iterable[Frame], storage: str = "mcap",
-           names: Mapping[str, str] = {}) -> Path:
-    """Write frames as a bag with the topics of lidar_perception.wire.topics, or other names for
-    some of them. InputError for an unknown storage."""
+def write_rosbags_bag(path: Path, frames: Iterable[Frame], storage: str = "mcap",
+                      names: Mapping[str, str] = {}) -> Path:
+    """Write frames as a bag by rosbags; return its path.
+
+    Args:
+        storage: mcap or sqlite3.
+        names: topic of lidar_perception.wire.topics -> another name.
+
+    Raises:
+        InputError: for an unknown storage.
+    """
     with tempfile.TemporaryDirectory() as folder:
         write_bag(Path(folder) / "bag", frames)
         return copy_bag(Path(folder) / "bag", path, storage, names)
 
 
 def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = {}) -> Path:
-    """The same messages in a bag that rosbags writes: storage is mcap or sqlite3."""
+    """Copy a bag by rosbags; arguments and errors are those of write_rosbags_bag."""
     if storage not in STORAGES:
         raise InputError(f"storage '{storage}' is none of {', '.join(STORAGES)}")
     with Bag(source) as recorded, Writer(path, version=9,
@@ -77,14 +91,17 @@ def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = 
     return path
 
 
-def frames_of(given: Sequence[Any] | Iterable[Frame], labels: Any = None, **options: Any
+def to_frames(given: Sequence[Any] | Iterable[Frame], labels: Any = None, **options: Any
               ) -> list[Frame]:
-    """Frames as they are, or recording() of clouds. InputError where Frames are given what they
-    have of their own, or an option that there is not: it would be lost without a word."""
+    """Return frames as they are, or make_frames() of clouds.
+
+    Raises:
+        InputError: for labels or options together with frames, which would be ignored.
+    """
     given = list(given)
     if not given or not isinstance(given[0], Frame):
-        return recording(given, labels, **options)
+        return make_frames(given, labels, **options)
     if refused := [*(() if labels is None else ("labels",)), *options]:
-        raise InputError(f"Frames have labels, times and a frame_id of their own, so they take no "
+        raise InputError(f"frames already have labels, times and a frame_id, so they take no "
                          f"{' and no '.join(refused)}; give arrays instead")
     return given

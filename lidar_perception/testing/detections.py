@@ -1,4 +1,4 @@
-"""Detections of any kind against those that are expected."""
+"""Comparison of detections of any type with expected objects."""
 
 from __future__ import annotations
 
@@ -13,24 +13,33 @@ from lidar_perception.types import CLASSES, InputError
 from msg_utils.detections import from_detection_array
 from msg_utils.markers import from_marker_array
 
-__tracebackhide__ = True  # pytest shows the line of the test that asserts
+__tracebackhide__ = True  # so that pytest shows the line in the test
 
-SHOWN = 20  # of what is missing, and of what is extra
+MAX_LISTED = 20  # missing and extra objects that are listed, each
 
 
 class Objects(NamedTuple):
-    """boxes (K, 7) float64 [x y z l w h yaw], NaN where only a centre is given; labels K class
-    names; scores (K,) float64, 1 where there is none."""
+    """Objects of any source.
+
+    boxes (K, 7) float64 [x y z l w h yaw], with NaN where only a centre is given; labels are K
+    class names; scores (K,) float64 are 1 where there are none.
+    """
 
     boxes: np.ndarray
     labels: list[str]
     scores: np.ndarray
 
 
-def objects_of(given: Any) -> Objects:
-    """The objects of a MarkerArray, a Detection3DArray (of rclpy or of rosbags), Detections,
-    GroundTruth, or pairs (class name, box), where a box is [x y z l w h yaw] or only [x y z].
-    InputError for anything else."""
+def to_objects(given: Any) -> Objects:
+    """Convert detections or labels to Objects.
+
+    Args:
+        given: a MarkerArray or Detection3DArray of rclpy or rosbags, Detections, GroundTruth, or
+            pairs (class name, box), where a box is [x y z l w h yaw] or only [x y z].
+
+    Raises:
+        InputError: for other types.
+    """
     if hasattr(given, "markers"):
         given = from_marker_array(given)
     elif hasattr(given, "detections"):
@@ -40,12 +49,12 @@ def objects_of(given: Any) -> Objects:
     elif hasattr(given, "labels"):
         labels = list(given.labels)
     else:
-        return _of_pairs(given)
+        return _from_pairs(given)
     boxes = np.asarray(given.boxes, np.float64).reshape(-1, 7)
     return Objects(boxes, labels, np.asarray(getattr(given, "scores", np.ones(len(boxes))), float))
 
 
-def _of_pairs(pairs: Any) -> Objects:
+def _from_pairs(pairs: Any) -> Objects:
     try:
         labels = [str(label) for label, _ in pairs]
         boxes = np.full((len(labels), 7), np.nan)
@@ -54,9 +63,9 @@ def _of_pairs(pairs: Any) -> Objects:
                 raise ValueError
             row[:len(box)] = box
     except (TypeError, ValueError):
-        raise InputError(f"{type(pairs).__name__} is no MarkerArray, Detection3DArray, Detections, "
-                         "GroundTruth or list of (class name, [x y z l w h yaw] or [x y z])"
-                         ) from None
+        raise InputError(f"{type(pairs).__name__} is not a MarkerArray, Detection3DArray, "
+                         "Detections, GroundTruth or list of (class name, [x y z l w h yaw] or "
+                         "[x y z])") from None
     return Objects(boxes, labels, np.ones(len(boxes)))
 
 
@@ -64,17 +73,26 @@ def assert_detections(found: Any, expected: Any, *, max_distance: float = MAX_CE
                       min_iou: float | None = None, same_class: bool = True,
                       max_missing: int = 0, max_extra: int | None = 0
                       ) -> list[tuple[int, int]]:
-    """Pair what was found with what is expected, both as objects_of() takes them, one to one: as
-    many pairs as possible, then the closest. Returns (row of found, row of expected) of each pair.
+    """Assert that the detections match the expected objects, both as to_objects() takes them.
 
-    Two are a pair if their centres are at most max_distance metres apart or, with min_iou, if their
-    overlap in space is at least that; and of the same class, unless same_class is False.
-    AssertionError, which lists what is missing and what is extra, if more than max_missing or
-    max_extra are (None: any number).
+    Detections and objects are paired one to one: as many pairs as possible, then the closest.
+
+    Args:
+        max_distance: largest distance of the centres of a pair in metres.
+        min_iou: smallest 3D IoU of a pair, in place of max_distance.
+        same_class: pairs must have the same class.
+        max_missing, max_extra: how many objects may be missed, and how many detections may have no
+            object; None for any number.
+
+    Returns:
+        (row of found, row of expected) of each pair.
+
+    Raises:
+        AssertionError: listing the missing and the extra objects.
     """
-    a, b = objects_of(found), objects_of(expected)
+    a, b = to_objects(found), to_objects(expected)
     if min_iou is not None and not np.isfinite(b.boxes).all():
-        raise InputError("min_iou needs whole boxes; some of what is expected has only a centre")
+        raise InputError("min_iou needs complete boxes; some expected objects have only a centre")
     distance = np.linalg.norm(a.boxes[:, None, :3] - b.boxes[None, :, :3], axis=2)
     if min_iou is None:
         cost, close = distance, distance <= max_distance
@@ -88,20 +106,20 @@ def assert_detections(found: Any, expected: Any, *, max_distance: float = MAX_CE
     extra = sorted(set(range(len(a.boxes))) - set(rows.tolist()))
     if len(missing) > max_missing or (max_extra is not None and len(extra) > max_extra):
         rule = (f"centres at most {max_distance:g} m apart" if min_iou is None else
-                f"overlap at least {min_iou:g}")
+                f"3D IoU at least {min_iou:g}")
         raise AssertionError("\n".join([
             f"{len(rows)} of {len(b.boxes)} expected objects were found, {len(extra)} more were "
             f"found ({rule}{', of the same class' if same_class else ''})",
-            *_listed("missing", b, missing, a, distance.T),
-            *_listed("extra", a, extra, b, distance)]))
+            *_list_objects("missing", b, missing, a, distance.T),
+            *_list_objects("extra", a, extra, b, distance)]))
     return list(zip(rows.tolist(), columns.tolist()))
 
 
-def _listed(word: str, objects: Objects, rows: Sequence[int], others: Objects,
-            distance: np.ndarray) -> list[str]:
-    """A line for each of the rows, with the nearest of the others."""
+def _list_objects(word: str, objects: Objects, rows: Sequence[int], others: Objects,
+                  distance: np.ndarray) -> list[str]:
+    """Return a line for each of the rows, with the nearest of the others."""
     lines = []
-    for i in rows[:SHOWN]:
+    for i in rows[:MAX_LISTED]:
         box = objects.boxes[i]
         size = "" if np.isnan(box[3]) else " size {:.2f} {:.2f} {:.2f}, yaw {:.2f}".format(*box[3:])
         nearest = ""
@@ -111,6 +129,6 @@ def _listed(word: str, objects: Objects, rows: Sequence[int], others: Objects,
         score = f", score {objects.scores[i]:.2f}" if word == "extra" else ""
         lines.append(f"  {word}: {objects.labels[i]} at ({box[0]:.2f}, {box[1]:.2f}, "
                      f"{box[2]:.2f}){size}{score}{nearest}")
-    if len(rows) > SHOWN:
-        lines.append(f"  ... and {len(rows) - SHOWN} more {word}")
+    if len(rows) > MAX_LISTED:
+        lines.append(f"  ... and {len(rows) - MAX_LISTED} more {word}")
     return lines

@@ -1,4 +1,4 @@
-"""Nodes forked from a process that has loaded what nodes need: most of their start is loading."""
+"""Nodes forked from a process with preloaded modules, because importing them takes most time."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 CONTEXT = multiprocessing.get_context("forkserver")  # its server starts with the first node
-CONTEXT.set_forkserver_preload(["lidar_perception.testing.loaded"])
+CONTEXT.set_forkserver_preload(["lidar_perception.testing.preload"])
 
 
-class Forked:
-    """As a subprocess.Popen of lidar_perception.nodes.main: its arguments, environment and log."""
+class ForkedNode:
+    """A node in a forked process, with the interface of subprocess.Popen."""
 
     def __init__(self, arguments: Sequence[str], environment: Mapping[str, str], log: Path):
         self.args = list(arguments)
         log.write_text("")
-        self.process = CONTEXT.Process(target=_node, args=(self.args, dict(environment), log),
+        self.process = CONTEXT.Process(target=_run_node, args=(self.args, dict(environment), log),
                                        daemon=True)
         self.process.start()
         self.pid = self.process.pid
@@ -29,11 +29,11 @@ class Forked:
         return self.process.exitcode
 
     def poll(self) -> int | None:
-        """The exit code; None while it runs."""
+        """Return the exit code, None while the process runs."""
         return self.process.exitcode
 
     def wait(self, timeout: float | None = None) -> int:
-        """The exit code. TimeoutExpired, if it runs longer."""
+        """Return the exit code; raise TimeoutExpired if the process runs longer."""
         self.process.join(timeout)
         if self.returncode is None:
             raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
@@ -47,8 +47,8 @@ class Forked:
         self.process.kill()
 
 
-def _node(arguments: list[str], environment: dict[str, str], log: Path) -> None:
-    """In the new process."""
+def _run_node(arguments: list[str], environment: dict[str, str], log: Path) -> None:
+    """Run a node; called in the new process."""
     os.environ.clear()
     os.environ.update(environment)
     file = os.open(log, os.O_WRONLY | os.O_APPEND)

@@ -1,6 +1,6 @@
-"""launch_testing: our launch files beside the nodes under test, on a domain of their own.
+"""launch_testing: launch files of this package and nodes under test on a private domain.
 
-Needs launch_testing and launch_ros, which come with ROS 2. In the tests, Peer() waits and asserts.
+Needs launch_testing and launch_ros of ROS 2. In the tests, Peer() waits and asserts.
 """
 
 from __future__ import annotations
@@ -15,16 +15,21 @@ from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.types import InputError
 
 
-def launch_file(name: str = "detectors", **arguments: Any) -> Any:
-    """The action that includes one of our launch files, launch/NAME.launch.py, with its arguments:
-    launch_file(detectors="pointpillars", points="/front/points"). InputError where launch is not
-    installed, or the package is not where ROS finds it, or has no such file."""
+def include_launch_file(name: str = "detectors", **arguments: Any) -> Any:
+    """Return the action that includes launch/NAME.launch.py of this package.
+
+    Example: include_launch_file(detectors="pointpillars", points="/front/points").
+
+    Raises:
+        InputError: if launch is not installed, if ROS does not find the package, or if there is no
+            such file.
+    """
     try:
         from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
         from launch.actions import IncludeLaunchDescription
         from launch.launch_description_sources import PythonLaunchDescriptionSource
     except ModuleNotFoundError as error:
-        raise _missing(error) from None
+        raise _missing_package_error(error) from None
     try:
         share = Path(get_package_share_directory("lidar_perception"))
     except PackageNotFoundError:
@@ -40,23 +45,28 @@ def launch_file(name: str = "detectors", **arguments: Any) -> Any:
         for key, value in arguments.items()])
 
 
-def description(*actions: Any) -> Any:
-    """What generate_test_description() returns: the actions, then ReadyToTest. From now on this
-    process and what it starts are on a ROS domain that nobody else uses, and on this machine only,
-    so that no test ever talks to a robot. InputError where launch_testing is not installed."""
+def make_description(*actions: Any) -> Any:
+    """Return the result of generate_test_description(): the actions, then ReadyToTest.
+
+    This process and the programs that it starts move to a private ROS domain limited to this
+    machine, so that a test never talks to a robot.
+
+    Raises:
+        InputError: if launch_testing is not installed.
+    """
     try:
         from launch.launch_description import LaunchDescription
         from launch_testing.actions import ReadyToTest
     except ModuleNotFoundError as error:
-        raise _missing(error) from None
+        raise _missing_package_error(error) from None
     os.environ.update(ROS_DOMAIN_ID=str(reserve_domain()),
                       ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
     use_large_shared_memory()
-    warm_up()  # what nodes compile is cached then; on a fresh machine that can outlast a wait
+    warm_up()  # on a fresh machine, compilation in a node could take longer than a wait
     return LaunchDescription([*actions, ReadyToTest()])
 
 
-def _missing(error: ModuleNotFoundError) -> InputError:
+def _missing_package_error(error: ModuleNotFoundError) -> InputError:
     package = str(error.name).partition(".")[0].replace("_", "-")
     return InputError(f"{error.name} is not installed; it comes with ROS 2 (ros-jazzy-{package}); "
                       "with pytest alone see docs/how-to/test-your-stack.md")

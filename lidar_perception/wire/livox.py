@@ -15,7 +15,7 @@ import numpy as np
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array
-from msg_utils.stamps import SECOND, header_message
+from msg_utils.stamps import SECOND_NS, make_header
 
 FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1",
           "line": "u1"}
@@ -44,7 +44,7 @@ def decode_livox(data: bytes) -> Any:
                          f"{count * POINT_BYTES - 1} bytes, the message has {len(points)}")
     kind = np.dtype({"names": [*FIELDS], "formats": [f"{order}{code}" for code in FIELDS.values()],
                      "offsets": OFFSETS, "itemsize": POINT_BYTES})
-    header = header_message(seconds * SECOND + nanoseconds, frame_id, bag_message)
+    header = make_header(seconds * SECOND_NS + nanoseconds, frame_id, bag_message)
     return from_array(np.frombuffer(points + b"\0", kind, count), header, bag_message)
 
 

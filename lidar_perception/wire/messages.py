@@ -30,7 +30,7 @@ from lidar_perception.types import (
 )
 from lidar_perception.wire.topics import CAMERA_FRAME
 from msg_utils.markers import MarkedObjects, to_marker_array
-from msg_utils.point_cloud2 import CloudError, columns, from_array, to_array, xyz
+from msg_utils.point_cloud2 import CloudError, from_array, read_columns, read_xyz, to_array
 from msg_utils.stamps import to_ns
 
 MAX_ID = 2**31  # marker ids are int32
@@ -61,7 +61,7 @@ def to_point_cloud(msg: Any, intensity_max: float | None = None,
         if "in_view" in (points.dtype.names or ()):
             indices = np.flatnonzero(_single(points, "in_view"))
             points = points.take(indices)
-        coordinates = xyz(points)
+        coordinates = read_xyz(points)
         intensity = None if intensity_max is None else _read_intensity(points, intensity_max, scale)
     except CloudError as error:
         raise InputError(str(error)) from None
@@ -85,7 +85,7 @@ def _read_intensity(points: np.ndarray, full: float, scale: FullScale) -> np.nda
 
 def _read_raw_intensity(points: np.ndarray) -> tuple[np.ndarray, np.dtype] | None:
     name = next((n for n in INTENSITY_FIELDS if n in (points.dtype.names or ())), None)
-    return None if name is None else (columns(points, (name,))[:, 0], points.dtype[name])
+    return None if name is None else (read_columns(points, (name,))[:, 0], points.dtype[name])
 
 
 def read_raw_intensity(msg: Any) -> tuple[np.ndarray, np.dtype] | None:

@@ -10,7 +10,7 @@ import numpy as np
 from lidar_perception.robot.deskew import PoseLookup, deskew
 from lidar_perception.types import InputError, PointCloud
 from msg_utils.point_cloud2 import CloudError, add_columns, to_array
-from msg_utils.stamps import SECOND, to_ns
+from msg_utils.stamps import SECOND_NS, to_ns
 
 # Names used by Ouster, Velodyne, Hesai and RoboSense, Autoware and Livox; the first match counts.
 NAMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
@@ -115,7 +115,7 @@ def deskew_points(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseL
         times = times._replace(seconds=times.seconds.take(timed))
         xyz = xyz.take(timed, axis=0)
     moved = deskew(xyz, times.seconds, lambda seconds: poses(
-        frame.stamp_ns + np.rint(seconds * SECOND).astype(np.int64)))
+        frame.stamp_ns + np.rint(seconds * SECOND_NS).astype(np.int64)))
     return timed, moved, times
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.messages import MAX_ID
-from msg_utils.markers import ADD, COLORS, OTHER_COLOR, box_pose, to_marker_array
-from msg_utils.stamps import duration_message
+from msg_utils.markers import ADD, COLORS, OTHER_COLOR, make_box_pose, to_marker_array
+from msg_utils.stamps import make_duration
 
 ARROW, LINE_STRIP, TEXT = 0, 4, 9
 # Namespaces in addition to those named after the classes.
@@ -47,7 +47,8 @@ def make_track_markers(ids: np.ndarray, detections: Detections, velocities: np.n
         top, has_arrow = box[:3] + [0.0, 0.0, box[5] / 2], p >= MIN_ARROW_PROBABILITY
         speed = f"  {np.hypot(*velocity):.1f} m/s" if has_arrow else ""
         extra_markers.append(_make_marker(make, header, NUMBER, i, label, lifetime_ns, type=TEXT,
-                                          text=f"{i}{speed}", scale=(0.0, 0.0, 0.6), pose=box_pose(
+                                          text=f"{i}{speed}", scale=(0.0, 0.0, 0.6),
+                                          pose=make_box_pose(
                                               np.append(top + [0.0, 0.0, 0.5], [0.0] * 4), make)))
         if has_arrow:
             ahead = top + [*velocity, 0.0]
@@ -77,9 +78,9 @@ def _make_marker(make: Any, header: Any, ns: str, number: int, label: str, lifet
                  scale: tuple[float, float, float],
                  points: Iterable[np.ndarray] = (), **more: Any) -> Any:
     r, g, b = COLORS.get(label, OTHER_COLOR)
-    more.setdefault("pose", box_pose(np.zeros(7), make))
+    more.setdefault("pose", make_box_pose(np.zeros(7), make))
     return make("visualization_msgs/msg/Marker", header=header, ns=ns, id=int(number), action=ADD,
-                lifetime=duration_message(lifetime_ns, make),
+                lifetime=make_duration(lifetime_ns, make),
                 scale=make("geometry_msgs/msg/Vector3", x=scale[0], y=scale[1], z=scale[2]),
                 color=make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=1.0),
                 points=[make("geometry_msgs/msg/Point", x=float(x), y=float(y), z=float(z))

@@ -24,18 +24,18 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.robot.poses import invert_pose
-from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_odometry
 from lidar_perception.wire.topics import ODOMETRY, TF, TF_STATIC
 from lidar_perception.wire.transforms import ODOMETRY_MESSAGE, TF_MESSAGE
-from msg_utils.stamps import SECOND, header_message
+from msg_utils.stamps import SECOND_NS, make_header
 
 
 def wheel_transforms():
     """Yield transforms of wheels, which turn for a while before the robot is localised."""
     for i in range(600):
-        stamp = START - SECOND + i * SECOND // 1000
+        stamp = START - SECOND_NS + i * SECOND_NS // 1000
         yield TF, TF_MESSAGE, stamp, tf(transform("base_link", "wheel", stamp, np.eye(4)))
 
 
@@ -65,7 +65,7 @@ def test_odometry_of_another_frame_is_transformed_to_the_sensor(tmp_path):
 
 
 def test_clouds_in_the_odometry_frame_do_not_move(tmp_path):
-    still = recorded(tmp_path / "bag", moving(ODOMETRY), cloud=lambda stamp: cloud_message(
+    still = recorded(tmp_path / "bag", moving(ODOMETRY), cloud=lambda stamp: make_cloud_message(
         np.ones((3, 4)), stamp, "odom"))
     assert all(np.array_equal(frame.pose(), np.eye(4)) for frame in still)
 
@@ -81,12 +81,12 @@ def test_converted_bag_has_sensor_odometry(tmp_path):
 def test_sensor_that_turns_on_the_robot_has_correct_poses(tmp_path):
     def turning():
         for i in range(-5, 60):
-            stamp = START + i * SECOND // 100
+            stamp = START + i * SECOND_NS // 100
             yield TF, TF_MESSAGE, stamp, tf(transform("base_link", "lidar", stamp, on_base(stamp)))
 
     def on_base(stamp):
         pose = np.eye(4)
-        pose[:3, :3] = Rotation.from_euler("z", 2 * (stamp - START) / SECOND).as_matrix()
+        pose[:3, :3] = Rotation.from_euler("z", 2 * (stamp - START) / SECOND_NS).as_matrix()
         return pose
 
     for frame, stamp in zip(recorded(tmp_path / "bag", moving(ODOMETRY), turning()), stamps()):
@@ -99,8 +99,8 @@ def test_no_pose_is_guessed(tmp_path):
     two = recorded(tmp_path / "two", moving("/left"), moving("/right"))
     assert POSES not in two.has
     short = recorded(tmp_path / "short", moving(ODOMETRY, "lidar", seconds=-1),
-                     [(ODOMETRY, ODOMETRY_MESSAGE, START - SECOND, make_odometry(
-                         base_at(START), header_message(START - SECOND, "odom", bag_message),
+                     [(ODOMETRY, ODOMETRY_MESSAGE, START - SECOND_NS, make_odometry(
+                         base_at(START), make_header(START - SECOND_NS, "odom", bag_message),
                          "lidar", bag_message))])
     assert [frame.pose() for frame in short] == [None] * CLOUDS  # it ends a second before
     circle = recorded(tmp_path / "circle", [(TF_STATIC, TF_MESSAGE, START, tf(
@@ -115,7 +115,7 @@ def test_invalid_poses_are_skipped_and_counted(tmp_path):
     def broken():
         message = next(iter(moving(ODOMETRY)))[3]
         message.pose.pose.orientation.w = message.pose.pose.orientation.z = 0.0
-        yield ODOMETRY, ODOMETRY_MESSAGE, START - SECOND, message
+        yield ODOMETRY, ODOMETRY_MESSAGE, START - SECOND_NS, message
 
     recording = recorded(tmp_path / "bag", broken(), moving(ODOMETRY), mount())
     check(recording)

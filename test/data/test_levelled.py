@@ -12,7 +12,7 @@ from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.robot.poses import invert_pose, make_pose
-from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.types import GroundTruth, PointCloud
 from lidar_perception.wire.messages import to_point_cloud
 from lidar_perception.wire.topics import ODOMETRY
@@ -97,7 +97,8 @@ def make_moving_cloud(stamp):
     seconds = np.linspace(0, 0.1, len(WORLD))
     measured = [invert_pose(base_at(stamp + t * 1e9) @ ON_BASE) @ [*point, 1]
                 for point, t in zip(WORLD, seconds)]
-    return cloud_message(np.array(measured)[:, :3], stamp, "lidar", time=seconds.astype(np.float32))
+    return make_cloud_message(np.array(measured)[:, :3], stamp, "lidar",
+                              time=seconds.astype(np.float32))
 
 
 @pytest.mark.parametrize("moves", [moving(ODOMETRY), moving_tf()], ids=["odometry", "TF"])

@@ -30,7 +30,7 @@ from lidar_perception.data.to_bag import write_bag
 from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 
 @each_recording
@@ -113,7 +113,7 @@ def test_cloud_topic_of_a_bag_is_found_or_chosen(tmp_path):
                 for i in range(2):
                     writer.write(topic, STAMP + i, from_array(
                         scene(i).astype("<f4").view([(n, "<f4") for n in "xyzi"]).ravel(),
-                        header_message(STAMP + i, "lidar", bag_message), bag_message))
+                        make_header(STAMP + i, "lidar", bag_message), bag_message))
         return tmp_path / name
 
     assert "on /ouster/points, 2" in str(open_recording(write_clouds("one", "/ouster/points")))

@@ -13,7 +13,7 @@ from lidar_perception.data.raw_clouds import choose_clouds, open_clouds
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array, to_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 LAYOUT = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "u1"), ("ring", "<u2"),
           ("t", "<u4"), ("normal", "<f4", (3,)), ("stamp", "<u8")]
@@ -176,7 +176,7 @@ def write(path, topics, count=4):
             bag.add_topic(topic, "sensor_msgs/msg/PointCloud2")
         for i in range(count):
             for topic in topics:
-                header = header_message(i * 10**8, topic.strip("/"), bag_message)
+                header = make_header(i * 10**8, topic.strip("/"), bag_message)
                 message = from_array(make_bag_points(90 + i), header, bag_message)
                 bag.write(topic, i * 10**8, message)
 

@@ -22,7 +22,7 @@ from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode
 from lidar_perception.wire.transforms import ODOMETRY_MESSAGE
 from msg_utils.markers import from_marker_array
-from msg_utils.messages import message_class
+from msg_utils.messages import load_message_class
 from msg_utils.point_cloud2 import CloudError, to_array
 
 CAMERA = {"input/camera_info": "sensor_msgs/msg/CameraInfo",
@@ -143,7 +143,7 @@ class FedNode:
         return Outcome(FAILED, problem) if problem else Outcome(SURVIVED)
 
     def _invalid_output(self) -> str | None:
-        clouds, boxes = message_class(CLOUD), message_class(MARKERS)
+        clouds, boxes = load_message_class(CLOUD), load_message_class(MARKERS)
         for publisher, data in self.sent:
             topic, kind = publisher.topic_name, publisher.msg_type
             try:

@@ -14,7 +14,7 @@ from lidar_perception.types import PEDESTRIAN, SENSOR_HEIGHT, GroundTruth
 from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.messages import make_camera_info, make_extrinsics, make_truth_markers
 from msg_utils.point_cloud2 import CloudError, add_columns, from_array, to_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 STAMP = 1_700_000_000_000_000_000
@@ -47,7 +47,7 @@ def street(seed: int = 0, people: int = 3, ground: int = 500) -> np.ndarray:
 
 def header() -> Any:
     """Return the header of all messages."""
-    return header_message(STAMP, "lidar", bag_message)
+    return make_header(STAMP, "lidar", bag_message)
 
 
 def cloud(kind: str = "columns") -> Any:
@@ -75,8 +75,8 @@ def valid_message(kind: str) -> bytes:
         truth = GroundTruth.of([PERSON], [PEDESTRIAN], [{"track_id": 3}])
         return encode(make_truth_markers(truth, header(), bag_message))
     if kind == "sensor_msgs/msg/CameraInfo":
-        return encode(make_camera_info(FORWARD_CAMERA, header_message(STAMP, "camera_optical",
-                                                                      bag_message), bag_message))
+        return encode(make_camera_info(FORWARD_CAMERA, make_header(STAMP, "camera_optical",
+                                                                   bag_message), bag_message))
     if kind == "geometry_msgs/msg/TransformStamped":
         return encode(make_extrinsics(FORWARD_CAMERA, header(), bag_message))
     if kind == "geometry_msgs/msg/PointStamped":

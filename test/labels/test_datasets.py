@@ -25,7 +25,7 @@ from lidar_perception.labels.formats import bag as bag_format
 from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.simulation.sensor import generic
 from lidar_perception.simulation.to_bag import simulated_scans
-from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.types import SENSOR_HEIGHT, Detections, GroundTruth, InputError, PointCloud
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_detection_markers
@@ -33,7 +33,7 @@ from lidar_perception.wire.topics import ODOMETRY, POINTS
 from lidar_studio import results
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import to_marker_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 SMALL = generic(32, -25.0, 5.0, 0.4, 10.0)
@@ -202,7 +202,7 @@ def test_detections_on_a_topic_become_labels(tmp_path, monkeypatch):
         expected = []
         for i, frame in enumerate(frames):
             found = Detections.of(rng.uniform(1, 9, (i, 7)) / [1, 1, 1, 1, 1, 1, 3], 0, 0.5)
-            header = header_message(frame.stamp_ns, "velodyne", bag_message)
+            header = make_header(frame.stamp_ns, "velodyne", bag_message)
             bag.write("/found", frame.stamp_ns, make_detection_markers(found, header, bag_message))
             bag.write("/tracks", frame.stamp_ns, to_detection_array(
                 found.boxes, ["tree"] * i, found.scores.tolist(), header=header, make=bag_message,
@@ -226,7 +226,7 @@ def test_boxes_are_transformed_to_the_frame_of_the_clouds(parts, tmp_path):
     rows = []
     for stamp in stamps():
         marked = to_marker_array(boxes, ["Car"], ids=[1], make=bag_message,
-                                 header=header_message(stamp, "odom", bag_message))
+                                 header=make_header(stamp, "odom", bag_message))
         rows += [(topic, MARKERS, stamp, marked) for topic in ("/n/output/detections",
                                                                "/n/output/tracks")]
     recording = recorded(tmp_path / "bag", *map(list, parts), rows)
@@ -259,7 +259,7 @@ def test_scans_with_equal_stamps_are_kept(tmp_path):
     with BagWriter(tmp_path / "unset") as bag:  # some drivers set no stamp
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
         for i, frame in enumerate(unset, 5):
-            bag.write(POINTS, i * 10**9, cloud_message(frame.load().xyz, 0, "top"))
+            bag.write(POINTS, i * 10**9, make_cloud_message(frame.load().xyz, 0, "top"))
     assert [f.stamp_ns for f in open_recording(tmp_path / "unset")] == [5 * 10**9, 6 * 10**9]
 
 

@@ -12,7 +12,7 @@ pytest.importorskip("launch_ros", reason="needs launch_ros, which comes with ROS
 from launch.actions import SetLaunchConfiguration
 
 from launch import LaunchDescription, LaunchService
-from lidar_perception.testing.launching import launch_file
+from lidar_perception.testing.launching import include_launch_file
 
 NOTHING_STARTS = {"detectors": "dream"}
 
@@ -25,6 +25,7 @@ def test_argument_that_a_launch_file_does_not_have_is_refused(name, given, words
     """Launch configurations of the file that includes ours are not its arguments."""
     service = LaunchService(noninteractive=True)
     service.include_launch_description(LaunchDescription([
-        SetLaunchConfiguration("map", "office"), launch_file(name, **NOTHING_STARTS, **given)]))
+        SetLaunchConfiguration("map", "office"), include_launch_file(name, **NOTHING_STARTS,
+                                                                     **given)]))
     assert service.run() == 1
     assert words in "".join(capfd.readouterr())

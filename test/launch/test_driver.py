@@ -22,7 +22,7 @@ import launch_testing
 import launch_testing.asserts
 
 from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES
-from lidar_perception.testing.launching import description, launch_file
+from lidar_perception.testing.launching import include_launch_file, make_description
 from lidar_perception.testing.peer import Peer
 
 DRIVER = Path(__file__).resolve().parents[1] / "ros" / "driver.py"
@@ -31,7 +31,7 @@ COUNT, POINTS = 20, 130_000  # clouds of 2 MB
 
 @pytest.mark.launch_test
 def generate_test_description():
-    return description(launch_file("perception", points="/driver_points", single=True))
+    return make_description(include_launch_file("perception", points="/driver_points", single=True))
 
 
 class TestDriver(unittest.TestCase):

@@ -22,9 +22,9 @@ import launch_testing.asserts
 from lidar_perception.nodes.graph import STAGES, list_result_topics
 from lidar_perception.simulation.scene import CROWDED
 from lidar_perception.simulation.to_bag import simulated_scans
-from lidar_perception.testing.bags import bag_of
-from lidar_perception.testing.detections import objects_of
-from lidar_perception.testing.launching import description, launch_file
+from lidar_perception.testing.bags import write_rosbags_bag
+from lidar_perception.testing.detections import to_objects
+from lidar_perception.testing.launching import include_launch_file, make_description
 from lidar_perception.testing.peer import Peer
 
 FOLDER = Path(tempfile.mkdtemp())
@@ -33,8 +33,9 @@ FRAMES = 6
 
 @pytest.mark.launch_test
 def generate_test_description():
-    bag = bag_of(FOLDER / "drive", simulated_scans(33, FRAMES, scenes=CROWDED))
-    return description(launch_file("replay", bag=bag, scores=FOLDER / "scores.json", loop=True))
+    bag = write_rosbags_bag(FOLDER / "drive", simulated_scans(33, FRAMES, scenes=CROWDED))
+    return make_description(include_launch_file("replay", bag=bag, scores=FOLDER / "scores.json",
+                                                loop=True))
 
 
 class TestReplay(unittest.TestCase):
@@ -43,7 +44,7 @@ class TestReplay(unittest.TestCase):
         with Peer() as peer:
             heard = peer.wait_for_messages(list_result_topics()["final"],
                                            "visualization_msgs/msg/MarkerArray", 2 * FRAMES)
-        assert any(len(objects_of(message).boxes) for message in heard)
+        assert any(len(to_objects(message).boxes) for message in heard)
 
 
 @launch_testing.post_shutdown_test()

@@ -18,8 +18,8 @@ import launch_testing
 import launch_testing.asserts
 
 from lidar_perception.nodes.graph import STAGES
-from lidar_perception.testing.clouds import cloud_message
-from lidar_perception.testing.launching import description, launch_file
+from lidar_perception.testing.clouds import make_cloud_message
+from lidar_perception.testing.launching import include_launch_file, make_description
 from lidar_perception.testing.peer import Peer
 
 SIDES = {"left": "/lidar_left", "right": "/right/points"}  # where their clouds come from
@@ -27,7 +27,7 @@ SIDES = {"left": "/lidar_left", "right": "/right/points"}  # where their clouds 
 
 @pytest.mark.launch_test
 def generate_test_description():
-    return description(launch_file("two_lidars", left=SIDES["left"]))
+    return make_description(include_launch_file("two_lidars", left=SIDES["left"]))
 
 
 class TestTwoLidars(unittest.TestCase):
@@ -38,8 +38,8 @@ class TestTwoLidars(unittest.TestCase):
             heard = {side: peer.listen(f"/{side}/candidate_refinement/output/detections",
                                        "visualization_msgs/msg/MarkerArray") for side in SIDES}
             for side, topic in SIDES.items():
-                peer.send(peer.talker(topic, "sensor_msgs/msg/PointCloud2"),
-                          cloud_message(street, 10**9, side), lambda s=side: heard[s],
+                peer.send(peer.advertise(topic, "sensor_msgs/msg/PointCloud2"),
+                          make_cloud_message(street, 10**9, side), lambda s=side: heard[s],
                           f"the result of {side}")
         for side, messages in heard.items():
             assert {m.header.frame_id for a in messages for m in a.markers} == {side}

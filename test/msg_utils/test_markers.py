@@ -18,10 +18,10 @@ from msg_utils.markers import (
     ADD,
     CUBE,
     DELETE,
-    box_pose,
+    compute_yaw,
     from_marker_array,
-    marker_keys,
-    pose_yaw,
+    list_marker_keys,
+    make_box_pose,
     to_marker_array,
 )
 
@@ -86,25 +86,25 @@ def test_markers_survive_the_wire(rows, remarks):
 @each_make
 @given(yaw=yaws)
 def test_the_quaternion_is_a_unit_and_turns_about_z_only(make, yaw):
-    pose = box_pose(np.array([1.0, 2, 3, 4, 5, 6, yaw]), make)
+    pose = make_box_pose(np.array([1.0, 2, 3, 4, 5, 6, yaw]), make)
     q = pose.orientation
     assert q.x == q.y == 0 and math.hypot(q.z, q.w) == pytest.approx(1, abs=1e-15)
     forward = (1 - 2 * q.z * q.z, 2 * q.z * q.w)  # where the quaternion takes the x axis
     assert forward == pytest.approx((math.cos(yaw), math.sin(yaw)), abs=1e-12)
     q.z, q.w = -q.z, -q.w  # the same rotation
-    assert math.remainder(pose_yaw(pose) - yaw, math.tau) == pytest.approx(0, abs=1e-12)
+    assert math.remainder(compute_yaw(pose) - yaw, math.tau) == pytest.approx(0, abs=1e-12)
 
 
 @each_make
 @given(before=objects, after=objects)
 def test_what_is_gone_is_deleted_and_nothing_else(make, before, after):
     first = array(make, before)
-    second = array(make, after, previous=marker_keys(first))
-    assert marker_keys(first) == {*keys(before)}
+    second = array(make, after, previous=list_marker_keys(first))
+    assert list_marker_keys(first) == {*keys(before)}
     deleted = [(m.ns, m.id) for m in second.markers if m.action == DELETE]
     gone = {*keys(before)} - {*keys(after)}
     assert sorted(deleted) == sorted(gone or ({("", 0)} if not after else ()))
-    assert marker_keys(second) == {*keys(after)}
+    assert list_marker_keys(second) == {*keys(after)}
     assert len(from_marker_array(second)) == len(after) and not from_marker_array(second).notes
 
 
@@ -114,7 +114,7 @@ def test_an_empty_array_says_which_frame_was_empty(make):
     got = from_marker_array(msg)
     assert len(got) == 0 and got.boxes.shape == (0, 7) and got.notes == []
     assert (got.stamp_ns, got.frame_id) == (STAMP, "velodyne")
-    assert marker_keys(msg) == frozenset()
+    assert list_marker_keys(msg) == frozenset()
 
 
 @each_make
@@ -140,7 +140,7 @@ def test_a_message_without_markers_is_empty(make):
 def test_cubes_of_other_nodes_are_read(make, text, score, extra):
     cube = make("visualization_msgs/msg/Marker", header=header(make, 5, "map"), ns="car", id=4,
                 type=CUBE, action=ADD, text=text,
-                pose=box_pose(np.array([1.0, 2, 3, 4, 5, 6, -2.0]), make),
+                pose=make_box_pose(np.array([1.0, 2, 3, 4, 5, 6, -2.0]), make),
                 scale=make("geometry_msgs/msg/Vector3", x=4.0, y=5.0, z=6.0))
     sphere = make("visualization_msgs/msg/Marker", header=header(make), type=2, action=ADD)
     clear = make("visualization_msgs/msg/Marker", action=3)  # DELETEALL, often without a header

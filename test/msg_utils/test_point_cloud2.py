@@ -12,12 +12,12 @@ from msg_utils.point_cloud2 import (
     DATATYPES,
     CloudError,
     add_columns,
-    columns,
-    dtype_of,
+    compute_dtype,
     from_array,
-    point_fields,
+    make_point_fields,
+    read_columns,
+    read_xyz,
     to_array,
-    xyz,
 )
 
 pytestmark = pytest.mark.no_cover  # others run these lines
@@ -78,7 +78,7 @@ def padded(make, cloud: np.ndarray, height: int, pad: int, unnamed=()):
     """An organised cloud with pad bytes of 0xAA after each row."""
     rows = np.frombuffer(cloud.tobytes(), np.uint8).reshape(height, -1)
     data = np.pad(rows, [(0, 0), (0, pad)], constant_values=0xAA)
-    fields = [*point_fields(cloud.dtype, make), *(field(make, "", at, 2) for at in unnamed)]
+    fields = [*make_point_fields(cloud.dtype, make), *(field(make, "", at, 2) for at in unnamed)]
     return message(make, fields, data.reshape(-1), height=height, width=len(cloud) // height,
                    point_step=cloud.dtype.itemsize, row_step=data.shape[1],
                    big=is_big(cloud.dtype))
@@ -148,7 +148,7 @@ def test_fields_without_a_name_are_padding(make):
 @each_make
 def test_a_count_of_zero_is_one_number(make):
     msg = message(make, [field(make, "x", 0, count=0)], np.zeros(4, np.uint8), point_step=4)
-    assert dtype_of(msg)["x"] == np.dtype("<f4")
+    assert compute_dtype(msg)["x"] == np.dtype("<f4")
 
 
 @each_make
@@ -211,7 +211,7 @@ def test_an_empty_cloud_stays_empty(make):
     assert len(to_array(empty)) == 0
     got = to_array(add_columns(empty, make, label=np.zeros(0, np.uint8)))
     assert len(got) == 0 and got.dtype.names == ("label",)
-    assert xyz(to_array(from_array(np.zeros(0, XYZ), header(make), make))).shape == (0, 3)
+    assert read_xyz(to_array(from_array(np.zeros(0, XYZ), header(make), make))).shape == (0, 3)
 
 
 @each_make
@@ -219,18 +219,18 @@ def test_an_empty_cloud_stays_empty(make):
 def test_xyz_reads_any_floating_point_cloud(make, kind):
     cloud = np.zeros(2, [("z", kind), ("ring", kind[0] + "u2"), ("y", kind), ("x", kind)])
     cloud["x"], cloud["y"], cloud["z"] = [1, np.nan], [3, np.inf], [5, 6]
-    got = xyz(to_array(from_array(cloud, header(make), make)))
+    got = read_xyz(to_array(from_array(cloud, header(make), make)))
     assert got.dtype == np.float32 and got.flags.c_contiguous
     np.testing.assert_array_equal(got, [[1, 3, 5], [np.nan, np.inf, 6]])
 
 
 def test_columns_come_in_the_order_they_are_asked_for():
     cloud = np.arange(6, dtype="<f4").view(XYZ)
-    assert columns(cloud, ("z", "x")).tolist() == [[2, 0], [5, 3]]
+    assert read_columns(cloud, ("z", "x")).tolist() == [[2, 0], [5, 3]]
 
 
 def test_xyz_beyond_float32_is_infinite_and_not_a_warning():
-    assert np.isinf(xyz(np.array([(1e300, 0, 0)], [(n, "<f8") for n in "xyz"]))[0, 0])
+    assert np.isinf(read_xyz(np.array([(1e300, 0, 0)], [(n, "<f8") for n in "xyz"]))[0, 0])
 
 
 @pytest.mark.parametrize("dtype, words", [
@@ -241,7 +241,7 @@ def test_xyz_beyond_float32_is_infinite_and_not_a_warning():
 ])
 def test_a_cloud_without_metres_names_the_field(dtype, words):
     with pytest.raises(CloudError, match=words):
-        xyz(np.zeros(2, dtype))
+        read_xyz(np.zeros(2, dtype))
 
 
 @each_make
@@ -251,7 +251,7 @@ def test_a_cloud_without_metres_names_the_field(dtype, words):
 def test_row_step_0_or_of_the_whole_cloud_is_that_of_a_row(make, height, width, step, more):
     cloud = np.arange(height * width * 2, dtype="f4").view([("a", "f4"), ("b", "f4")])
     data = np.pad(cloud.view(np.uint8), (0, more))
-    msg = message(make, point_fields(cloud.dtype, make), data, height=height, width=width,
+    msg = message(make, make_point_fields(cloud.dtype, make), data, height=height, width=width,
                   point_step=8, row_step=step(height, width))
     assert same(to_array(msg), cloud)
     wider = to_array(add_columns(msg, make, c=cloud["a"]))
@@ -266,7 +266,7 @@ def test_row_step_0_or_of_the_whole_cloud_is_that_of_a_row(make, height, width, 
     (dict(height=3, width=1, row_step=7), "row_step = 7 is less than width x point_step = 8"),
     (dict(point_step=0), "point_step is 0 for 3 points"),
     (dict(point_step=6), "field 'b' at offset 4 reaches past point_step = 6"),
-    (dict(names="aa"), "field 'a' comes twice"),
+    (dict(names="aa"), "field 'a' exists twice"),
     (dict(datatypes=(7, 9)), "field 'b' has datatype 9"),
     (dict(datatypes=(0, 7)), "field 'a' has datatype 0"),
     (dict(count=2), "field 'b' at offset 4 reaches past point_step = 8"),
@@ -287,7 +287,7 @@ def test_what_point_cloud2_cannot_say_is_refused(make, dtype):
 
 @each_make
 def test_rows_of_different_length_are_refused(make):
-    with pytest.raises(ValueError, match="5 points do not make 2 rows"):
+    with pytest.raises(ValueError, match="5 points cannot be split into 2 rows"):
         from_array(np.zeros(5, XYZ), header(make), make, height=2)
 
 

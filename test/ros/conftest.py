@@ -43,7 +43,7 @@ def found(request, shared_processes, shared_peer, weights):
 def talker(request, shared_peer, found):
     """Straight to the detector."""
     from test_bad_input import CLOUD
-    return shared_peer.talker(request.module.DETECTOR.between, CLOUD)
+    return shared_peer.advertise(request.module.DETECTOR.between, CLOUD)
 
 
 @pytest.fixture

@@ -13,10 +13,10 @@ from detection_samples import frame, lively, tiny
 
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.param_fields import flatten, with_values
-from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_detections, to_point_cloud
-from msg_utils.markers import box_pose, from_marker_array, pose_yaw
+from msg_utils.markers import compute_yaw, from_marker_array, make_box_pose
 
 REMAP = {"~/input/points": "/in", "~/output/detections": "/found"}
 
@@ -68,7 +68,7 @@ def small_v4(folder: Path) -> Path:
 
 def message(stamp, **columns):
     """The scan of detection_samples, with columns of its own."""
-    return cloud_message(np.column_stack([frame().xyz, frame().intensity]), stamp, **columns)
+    return make_cloud_message(np.column_stack([frame().xyz, frame().intensity]), stamp, **columns)
 
 
 def received(messages, stamp):
@@ -80,7 +80,7 @@ def assert_equal(objects, expected):
     found = to_detections(objects)
     assert len(expected) > 3
     np.testing.assert_array_equal(found.boxes[:, :6], expected.boxes[:, :6])
-    yaws = [pose_yaw(box_pose(box, bag_message)) for box in expected.boxes]  # -pi .. pi
+    yaws = [compute_yaw(make_box_pose(box, bag_message)) for box in expected.boxes]  # -pi .. pi
     np.testing.assert_array_equal(found.boxes[:, 6], np.float32(yaws))
     np.testing.assert_array_equal(found.scores, expected.scores)
     np.testing.assert_array_equal(found.class_ids, expected.class_ids)

@@ -9,20 +9,20 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.scoring.centres.report import pedestrians
-from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.testing.detections import assert_detections
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_point_cloud
 from msg_utils.markers import from_marker_array
 from msg_utils.point_cloud2 import from_array, to_array
-from msg_utils.stamps import header_message, to_ns
+from msg_utils.stamps import make_header, to_ns
 
 CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
 XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 
 
 def cloud(xyz, stamp=1, **changes):
-    msg = cloud_message(xyz, stamp)
+    msg = make_cloud_message(xyz, stamp)
     for name, value in changes.items():
         setattr(msg, name, value)
     return msg
@@ -46,7 +46,7 @@ def integer_z():
 
 def big_endian(xyz, stamp):
     points = np.asarray(xyz, np.float32).view(XYZ).reshape(-1).astype(XYZ.newbyteorder(">"))
-    return from_array(points, header_message(stamp, "lidar", bag_message), bag_message)
+    return from_array(points, make_header(stamp, "lidar", bag_message), bag_message)
 
 
 BAD = {  # what is wrong -> message, words that the diagnostic must hold
@@ -76,7 +76,7 @@ def peer(shared_peer):
 def send(shared_processes, peer):
     """send(node, cloud, condition, what) until the condition holds; each node has its own topic."""
     nodes = "ground_segmentation", "perception", "clustering", "candidate_refinement"
-    talkers = {node: peer.talker(f"/{node}/input/points", CLOUD) for node in nodes}
+    talkers = {node: peer.advertise(f"/{node}/input/points", CLOUD) for node in nodes}
     for node in nodes:
         shared_processes.start(node, {}, {**QUIET, "seed.source": "file"})
     return lambda node, *rest: peer.send(talkers[node], *rest)
@@ -138,7 +138,7 @@ def test_no_method_dies_of_a_strange_cloud(values, send, serve, results, shared_
             send(node, msg, lambda: True, "a subscriber")
             serve(node, cloud(some, stamp))
     assert {r.width for r in results[node][before:]} >= {1_000_000, len(xyz), 2001}
-    assert "PatchWork" not in shared_processes.log(node)
+    assert "PatchWork" not in shared_processes.read_log(node)
 
 
 def test_a_wrong_height_and_a_wrong_scale_of_intensity_are_said(send, peer, good_cloud):
@@ -197,11 +197,11 @@ def test_without_camera_and_seed_the_diagnostics_say_so_and_a_click_helps(
 
         people = pedestrians(next(iter(open_recording(drive_bag))).truth())
         nearest = people[np.argmin(np.hypot(people[:, 0], people[:, 1]))]
-        click = peer.talker("/clicked_point", "geometry_msgs/msg/PointStamped")
+        click = peer.advertise("/clicked_point", "geometry_msgs/msg/PointStamped")
         point = bag_message("geometry_msgs/msg/Point", x=nearest[0], y=nearest[1], z=nearest[2])
         for frame_id, words in (("map", "frame 'map'"), ("velodyne", "detecting")):
             clicked = bag_message("geometry_msgs/msg/PointStamped", point=point,
-                                  header=header_message(0, frame_id, bag_message))
+                                  header=make_header(0, frame_id, bag_message))
             peer.send(click, clicked, click.get_subscription_count, "a subscriber of the click")
             said(words)
         peer.wait(lambda: len(from_marker_array(found[-1])), "candidates, which may come late")

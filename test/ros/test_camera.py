@@ -48,7 +48,7 @@ def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, qos, proc
     for node, remap in graph.items():
         processes.start(node, remap, {**flatten(PAPER), "input.max_wait": 3600.0})
     found = peer.listen(f"/{last}/output/detections", MARKERS)
-    truth, cloud = peer.talker(TRUTH, MARKERS), peer.talker(POINTS, CLOUD)
+    truth, cloud = peer.advertise(TRUTH, MARKERS), peer.advertise(POINTS, CLOUD)
     peer.wait_for_graph(graph)
     peer.send(cloud, sent[POINTS], lambda: "waits for the camera's calibration"
               in peer.get_message(first), "the reason why it waits")
@@ -57,7 +57,7 @@ def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, qos, proc
     for topic, over in ((CAMERA_INFO, "no CameraInfo on"),
                         (EXTRINSICS, "waits for the camera")):
         assert not found
-        talker = peer.talker(topic, types[topic], qos)
+        talker = peer.advertise(topic, types[topic], qos)
         if qos is LATCHED:
             talker.publish(encode(camera[topic]))
         else:

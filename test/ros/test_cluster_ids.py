@@ -15,7 +15,7 @@ from lidar_perception.candidates.seed_sources import make_fixed_source
 from lidar_perception.candidates.seeds import load_seed
 from lidar_perception.data.open import open_recording
 from lidar_perception.param_fields import with_values
-from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.wire.messages import read_column, to_point_cloud
 from msg_utils.markers import from_marker_array
 
@@ -33,8 +33,8 @@ def test_boxes_and_candidates_have_the_ids_of_the_cloud(processes, peer, drive_b
     assert len(segmented.indices) == len(scan)
     own = segmented.cluster_ids.astype(np.int64)
     foreign = np.where(own > 0, 2**32 - 5 - 7 * own, 0)
-    msg = cloud_message(scan.xyz, ground=segmented.ground.astype("u1"),
-                        cluster_id=foreign.astype("u4"))
+    msg = make_cloud_message(scan.xyz, ground=segmented.ground.astype("u1"),
+                             cluster_id=foreign.astype("u4"))
     _, expected = find_candidates(scan, seed, None, params, ground=segmented.ground,
                                   cluster_ids=foreign)
     assert len(expected.final) and expected.clusters.max() > 2**31 and set(
@@ -46,7 +46,7 @@ def test_boxes_and_candidates_have_the_ids_of_the_cloud(processes, peer, drive_b
                         {"seed.source": "file"})
     found, boxes, out = (peer.listen("/found", MARKERS), peer.listen("/boxes", MARKERS),
                          peer.listen("/out", CLOUD))
-    peer.send(peer.talker("/in", CLOUD), msg, lambda: found and boxes and out, "results of both")
+    peer.send(peer.advertise("/in", CLOUD), msg, lambda: found and boxes and out, "results of both")
 
     candidates = from_marker_array(found[-1])
     assert [text["cluster_id"] for text in candidates.extras] == expected.clusters.tolist()

@@ -14,7 +14,7 @@ from lidar_perception.robot.deskew import make_constant_motion, skew
 from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.messages import read_column, to_point_cloud
 from msg_utils.point_cloud2 import to_array
-from msg_utils.stamps import time_message
+from msg_utils.stamps import make_time
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -77,7 +77,7 @@ def test_a_cloud_of_a_moving_sensor_is_moved_to_its_stamp(start, source):
         moved[:, 0])
     give(node, message(raw, START + PERIOD))
     assert "no time column" in problems(node) and len(node.sent["points"]) == 3
-    assert time_message(START, bag_message).sec == after.header.stamp.sec and len(frame_)
+    assert make_time(START, bag_message).sec == after.header.stamp.sec and len(frame_)
 
 
 def test_the_first_cloud_waits_for_odometry_that_lags_behind_the_end_of_its_turn(start):

@@ -27,7 +27,7 @@ from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.messages import make_detection_markers, to_class_ids
 from msg_utils.markers import from_marker_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 SENSOR = mounted(1.2, 0.3, 1.8, 0.6, 0.0, 0.0)  # on the base
 
@@ -37,7 +37,7 @@ def base_at(i):
 
 
 def header(stamp, frame_id="lidar"):
-    return header_message(stamp, frame_id, bag_message)
+    return make_header(stamp, frame_id, bag_message)
 
 
 def tracked(node):

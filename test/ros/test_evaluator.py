@@ -15,12 +15,12 @@ from lidar_perception.nodes.replay.evaluator import MAX_INCOMPLETE_FRAMES, Evalu
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_detection_markers
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 
 def array(number, frame_id="lidar"):
-    return make_detection_markers(next(crowd()), header_message(START + number * TENTH, frame_id,
-                                                                bag_message), bag_message)
+    return make_detection_markers(next(crowd()), make_header(START + number * TENTH, frame_id,
+                                                             bag_message), bag_message)
 
 
 def said(node):

@@ -72,7 +72,7 @@ def test_no_cloud_ends_the_detector(talker, found, shared_processes, shared_peer
                          f"'{words}': {name}")
     shared_peer.send(talker, message(7), lambda: received(found, 7), "detections of a good cloud")
     assert_equal(received(found, 7), DETECTOR.offline(weights, message(7)))
-    log = shared_processes.log(NODE)
+    log = shared_processes.read_log(NODE)
     assert "Traceback" not in log and "Warning" not in log
 
 

@@ -83,7 +83,7 @@ def test_recorder_completes_its_bag(number, processes, peer, tmp_path):
     bag, note = tmp_path / "bag", bag_message(NOTE)
     process, _ = start(processes, "ros2 run", "bag_recorder", "--ros-args", "-p", f"bag:={bag}",
                        "-p", "topics:=[/note]")
-    peer.send(peer.talker("/note", NOTE), note,
+    peer.send(peer.advertise("/note", NOTE), note,
               lambda: int(peer.get_value("bag_recorder", "frames") or 0) > 1, "two notes")
     process.send_signal(number)
     assert process.wait(timeout=60) == 0

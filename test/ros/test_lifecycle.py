@@ -23,7 +23,7 @@ from lidar_perception.nodes.reception import Reception
 from lidar_perception.nodes.runtime import ERROR, OK, WAITING
 from lidar_perception.nodes.tracker import TrackerNode
 from lidar_perception.wire.codec import encode
-from msg_utils.messages import ros_message
+from msg_utils.messages import make_ros_message
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 LEADS_TO = {"configure": State.PRIMARY_STATE_INACTIVE, "activate": State.PRIMARY_STATE_ACTIVE,
@@ -118,7 +118,7 @@ def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
     assert state(peer, node) == State.PRIMARY_STATE_UNCONFIGURED
     peer.wait(lambda: peer.get_value(node, "lifecycle") == "unconfigured", "its diagnostics")
     assert ord(peer.diagnostics[node].level) == 0 and peer.get_message(node) == "not configured"
-    talker = peer.talker(f"/{node}/input/points", CLOUD)
+    talker = peer.advertise(f"/{node}/input/points", CLOUD)
     found = peer.listen(f"/{node}/output/detections", MARKERS)
     drive(peer, node, "configure")
     assert talker.get_subscription_count() == 0
@@ -151,12 +151,12 @@ def test_a_node_that_nobody_asks_for_anything_says_so_while_there_is_input(here,
         node = here(kind, {"autostart": False}, {f"~/input/{topic}": f"/{topic}"})
         name = node.get_name()
         peer.wait(lambda n=name: peer.get_message(n) == "not configured", "its diagnostics")
-        talker = peer.talker(f"/{topic}", sent)
+        talker = peer.advertise(f"/{topic}", sent)
         peer.wait_for_diagnostics(name, f"ros2 lifecycle set /{name} configure", level=1)
         peer.node.destroy_publisher(talker)
         peer.wait(lambda n=name: peer.get_message(n) == "not configured", "the end of the input")
         drive(peer, name, "configure", "cleanup")
-        peer.talker(f"/{topic}", sent)
+        peer.advertise(f"/{topic}", sent)
         peer.wait(lambda n=node, t=topic: n.count_publishers(f"/{t}"), "the input again")
         node._tick()
         assert node.state == (OK, "not configured")
@@ -164,7 +164,7 @@ def test_a_node_that_nobody_asks_for_anything_says_so_while_there_is_input(here,
 
 def test_cleanup_leaves_nothing_of_the_network(here, peer, weights):
     node = here(PointPillarsNode, {**DETECTOR.values(weights), "autostart": False}, REMAP)
-    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
+    talker, found = peer.advertise("/in", CLOUD), peer.listen("/found", MARKERS)
     empty, names = entities(node), set(vars(node))
     for stamp in (1, 2):
         drive(peer, NODE, "configure")
@@ -183,11 +183,12 @@ def test_cleanup_leaves_nothing_of_the_network(here, peer, weights):
 def test_the_clock_of_a_simulation_goes_on_after_a_cleanup(here, peer):
     """Whether it was set before the node was configured or since."""
     name, clock = "ground_segmentation", "rosgraph_msgs/msg/Clock"
-    node, talker = here(GroundSegmentation, {}, {}), peer.talker("/clock", clock)
+    node, talker = here(GroundSegmentation, {}, {}), peer.advertise("/clock", clock)
     for second, sim_time in enumerate((False, True, True), start=1):
         peer.set_parameter(f"/{name}", "use_sim_time", sim_time)
         drive(peer, name, "deactivate", "cleanup", "configure", "activate")
-        told = ros_message(clock, clock=ros_message("builtin_interfaces/msg/Time", sec=second))
+        told = make_ros_message(clock, clock=make_ros_message("builtin_interfaces/msg/Time",
+                                                              sec=second))
         assert node.count_subscribers("/clock") == sim_time
         if sim_time:
             peer.send(talker, told, lambda s=second: node.get_clock().now().nanoseconds
@@ -211,7 +212,7 @@ def test_a_node_without_its_network_waits_for_the_file_and_says_so(nodes, peer, 
     part.rename(later)
     drive(peer, driven, "configure", "activate")
     for node in (driven, alone):
-        talker = peer.talker(f"/{node}/input/points", CLOUD)
+        talker = peer.advertise(f"/{node}/input/points", CLOUD)
         found = peer.listen(f"/{node}/output/detections", MARKERS)
         peer.send(talker, message(1), lambda f=found: received(f, 1), "detections")
         assert_equal(received(found, 1), offline(weights, message(1)))
@@ -245,7 +246,7 @@ def test_an_activation_that_fails_is_said_and_tried_again(here, peer, monkeypatc
 def test_what_waits_is_dropped_and_counted_and_the_pause_is_no_loss(here, peer, good_cloud):
     """sent = frames + dropped + lost holds over a pause, for what is sent while active."""
     node = here(GroundSegmentation, {"input.queue": 3}, {"~/input/points": "/in"})
-    talker = peer.talker("/in", CLOUD)
+    talker = peer.advertise("/in", CLOUD)
     peer.send(talker, good_cloud, lambda: node.counts["frames"], "a frame")
     name = "ground_segmentation"
     reception, = node._receptions()

@@ -22,7 +22,7 @@ from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import to_detections
 from lidar_perception.wire.transforms import TF_MESSAGE
 from msg_utils.markers import from_marker_array, to_marker_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 FOUND = "/perception/output/detections"
@@ -38,7 +38,7 @@ class Looking:
 
     @property
     def url(self):
-        found = re.search(r"http://\S+", self.processes.log("view"))
+        found = re.search(r"http://\S+", self.processes.read_log("view"))
         return found and found.group()
 
     def bytes(self, path):
@@ -137,7 +137,7 @@ def test_the_newest_frame_appears_and_one_can_pause_and_step_back(looking, heard
 
 def test_boxes_in_another_frame_are_shown_where_tf_says(looking, heard, shared_peer):
     """Those of the detector again, as a node publishes them whose target_frame is the robot's."""
-    talker, place = shared_peer.talker("/robot/output/detections", MARKERS), mounted(
+    talker, place = shared_peer.advertise("/robot/output/detections", MARKERS), mounted(
         0.5, 0.2, 1.7, 0.0, 0.0, 0.3)
     sent = 0
 
@@ -147,7 +147,7 @@ def test_boxes_in_another_frame_are_shown_where_tf_says(looking, heard, shared_p
             sent, found = len(heard), from_marker_array(heard[-1])
             talker.publish(encode(to_marker_array(
                 transform_boxes(found.boxes, place), found.labels, found.scores, make=bag_message,
-                header=header_message(found.stamp_ns, "base", bag_message))))
+                header=make_header(found.stamp_ns, "base", bag_message))))
 
     def lines():
         send()
@@ -158,7 +158,7 @@ def test_boxes_in_another_frame_are_shown_where_tf_says(looking, heard, shared_p
     if not has_tf():
         shared_peer.wait(lambda: NO_TF in lines(), "a line that says what is not installed")
         pytest.skip("the wheels of the pip environment lack tf2_msgs")
-    static = shared_peer.talker("/tf_static", TF_MESSAGE, STATIC_QOS)
+    static = shared_peer.advertise("/tf_static", TF_MESSAGE, STATIC_QOS)
     static.publish(encode(transforms(("base", "velodyne", place, 0))))
 
     def same():
@@ -175,4 +175,4 @@ def test_boxes_in_another_frame_are_shown_where_tf_says(looking, heard, shared_p
 
 def test_it_ends_cleanly_at_sigint(looking, heard, shared_processes):
     assert shared_processes.end("view", 60.0) == 0
-    assert "Traceback" not in shared_processes.log("view")
+    assert "Traceback" not in shared_processes.read_log("view")

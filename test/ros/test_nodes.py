@@ -24,7 +24,7 @@ from lidar_perception.nodes.perception import Perception
 from lidar_perception.nodes.rclpy_compat import parameter_names
 from lidar_perception.nodes.runtime import ERROR, LATCHED, OK, WARN
 from lidar_perception.param_fields import collect_fields, flatten
-from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.wire.codec import bag_message
 from msg_utils.markers import from_marker_array
 
@@ -57,7 +57,7 @@ def perception(shared_processes):
 
 @pytest.fixture(scope="module")
 def talker(shared_peer):
-    return shared_peer.talker("/perception/input/points", CLOUD)
+    return shared_peer.advertise("/perception/input/points", CLOUD)
 
 
 def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
@@ -82,7 +82,7 @@ def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
         for name, value, words in [("stm.threshold", 1.5, ""),
                                    ("clustering.dbscan.eps", [0.1], "range_limits"),
                                    ("seed.source", "dream", "ground_truth, click, file")]:
-            refused, = peer.change("/perception", {name: value})
+            refused, = peer.set_parameters("/perception", {name: value})
             assert refused and words in refused
 
 
@@ -160,7 +160,7 @@ def test_bad_parameter_files_are_refused_in_one_line(processes):
                                               ("clustering.dbscan.eps", [0.1], "range_limits")]):
         processes.start("perception", {}, {name: value}, namespace=f"bad{i}")
         assert processes.running[f"bad{i}.perception"].wait(timeout=60) == 2
-        log = processes.log(f"bad{i}.perception")
+        log = processes.read_log(f"bad{i}.perception")
         assert words in log and "Traceback" not in log
 
 
@@ -181,12 +181,12 @@ def test_inputs_that_are_not_asked_for_change_nothing(perception, shared_peer, t
     for topic, kind in (("/clicked_point", "geometry_msgs/msg/PointStamped"),
                         ("/perception/input/camera_info", "sensor_msgs/msg/CameraInfo"),
                         ("/perception/input/extrinsics", "geometry_msgs/msg/TransformStamped")):
-        other = peer.talker(topic, kind, LATCHED)
+        other = peer.advertise(topic, kind, LATCHED)
         peer.send(other, bag_message(kind), other.get_subscription_count, "a subscriber")
     before = len(found)
     peer.send(talker, good_cloud, lambda: len(found) > before + 2, "more candidates")
     np.testing.assert_array_equal(from_marker_array(found[-1]).boxes, first.boxes)
-    assert "Error" not in perception.log("perception")
+    assert "Error" not in perception.read_log("perception")
 
 
 def test_markers_that_go_away_are_deleted_and_time_that_jumps_back_is_noticed(
@@ -196,11 +196,11 @@ def test_markers_that_go_away_are_deleted_and_time_that_jumps_back_is_noticed(
     full = from_marker_array(received[-1])
     assert len(full) > 20
     assert full.ids.tolist() == [text["id"] for text in full.extras] == [*range(1, 1 + len(full))]
-    empty = cloud_message(np.zeros((0, 3)), 5 * 10**9, "velodyne")
+    empty = make_cloud_message(np.zeros((0, 3)), 5 * 10**9, "velodyne")
     peer.send(talker, empty, lambda: len(from_marker_array(received[-1])) == 0, "no boxes")
     deleted = [m for r in received for m in r.markers if m.action == 2]
     assert {m.id for m in deleted} >= set(full.ids.tolist())
-    peer.wait(lambda: "time jumped back" in perception.log("perception"), "the log line")
+    peer.wait(lambda: "time jumped back" in perception.read_log("perception"), "the log line")
 
 
 def test_a_bag_that_starts_again_pairs_its_clouds_with_the_new_round():
@@ -252,7 +252,7 @@ def test_section_of_a_parameter_file_that_is_misspelt_is_said_by_its_node(proces
                     "pointnet_detectr: {ros__parameters: {autostart: false}}\n")
     processes.run_node("tracker", ["tracker", "--ros-args", "--params-file", str(file)])
     process = processes.running["tracker"]
-    while "ready" not in (log := processes.log("tracker")):
+    while "ready" not in (log := processes.read_log("tracker")):
         assert process.poll() is None
         sleep(0.05)
     warned, = [line for line in log.splitlines() if "[WARN]" in line and "mine.yaml" in line]

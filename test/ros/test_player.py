@@ -248,9 +248,9 @@ def test_it_waits_until_a_node_of_ours_has_met_who_listens_to_it(processes, peer
     publishes meanwhile would be lost."""
     me = peer.node.get_name()
     between = f"/{me}/output/between"
-    said = peer.talker("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
-    peer.talker(f"/{me}/debug/processing_time_ms", "std_msgs/msg/Float64")
-    peer.talker(between, TEXT)
+    said = peer.advertise("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+    peer.advertise(f"/{me}/debug/processing_time_ms", "std_msgs/msg/Float64")
+    peer.advertise(between, TEXT)
     peer.listen(between, TEXT)
     heard = peer.listen("/text", TEXT)
 
@@ -297,7 +297,7 @@ def refused(shared_processes, text_bag, drive_bag, tmp_path_factory):
 @pytest.mark.parametrize("case", BAD)
 def test_what_cannot_be_played_is_one_line_and_exit_code_2(refused, shared_processes, case):
     assert shared_processes.running[f"{case}.bag_player"].wait(timeout=60) == 2
-    log = shared_processes.log(f"{case}.bag_player")
+    log = shared_processes.read_log(f"{case}.bag_player")
     assert BAD[case][1] in log.splitlines()[-1] and "Traceback" not in log
     assert case != "truncated" or str(refused) in log
 
@@ -317,7 +317,7 @@ def test_the_recorder_writes_what_the_player_plays(processes, peer, text_bag, tm
 
 def test_the_recorder_has_what_each_of_several_publishers_latched(processes, peer, tmp_path):
     for i in range(6):  # as each node with a fixed sensor does on /tf_static
-        peer.talker("/note", TEXT, LATCHED).publish(encode(bag_message(TEXT, data=str(i))))
+        peer.advertise("/note", TEXT, LATCHED).publish(encode(bag_message(TEXT, data=str(i))))
     processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["/note"]})
     peer.wait(lambda: peer.get_value("bag_recorder", "frames") == "6", "six messages")
     assert processes.stop()["bag_recorder"] == 0
@@ -327,14 +327,14 @@ def test_the_recorder_has_what_each_of_several_publishers_latched(processes, pee
 
 def test_a_publisher_that_comes_later_and_offers_less_is_recorded_too(processes, peer, tmp_path):
     """Also by a name of the node's namespace."""
-    first = peer.talker("/robot/text", TEXT, RELIABLE)
+    first = peer.advertise("/robot/text", TEXT, RELIABLE)
     processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["text"]},
                     namespace="robot")
 
     def frames():
         return int(peer.get_value("robot/bag_recorder", "frames") or 0)
     peer.send(first, bag_message(TEXT, data="first"), frames, "the first")
-    before, later = frames(), peer.talker("/robot/text", TEXT, SENSOR_DATA)
+    before, later = frames(), peer.advertise("/robot/text", TEXT, SENSOR_DATA)
     peer.send(later, bag_message(TEXT, data="later"), lambda: frames() > before, "the later one")
     assert processes.stop()["robot.bag_recorder"] == 0
     with Bag(tmp_path / "bag") as bag:
@@ -343,15 +343,15 @@ def test_a_publisher_that_comes_later_and_offers_less_is_recorded_too(processes,
 
 def test_a_type_that_is_not_installed_ends_no_recording(monkeypatch, peer, start, tmp_path):
     from lidar_perception.nodes.replay import bag_recorder
-    known = bag_recorder.message_class
+    known = bag_recorder.load_message_class
 
     def lacking(name):
         if name == INFO:
             raise ModuleNotFoundError
         return known(name)
-    monkeypatch.setattr(bag_recorder, "message_class", lacking)
-    peer.talker("/info", INFO)
-    peer.talker("/text", TEXT)
+    monkeypatch.setattr(bag_recorder, "load_message_class", lacking)
+    peer.advertise("/info", INFO)
+    peer.advertise("/text", TEXT)
     node = start(bag_recorder.BagRecorder, bag=str(tmp_path / "bag"), topics=("/info", "/text"))
     peer.wait(lambda: [node._discover(), not node.waiting][1], "both to be found")
     node.close()

@@ -57,7 +57,7 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
     times = {step: peer.listen(f"/{NODE}/debug/{step}_ms", "std_msgs/msg/Float64")
              for step in STEPS}
     peer.wait_for_diagnostics(NODE, "waiting for input")
-    peer.send(peer.talker(POINTS, CLOUD), message(1), lambda: points and received(found, 1),
+    peer.send(peer.advertise(POINTS, CLOUD), message(1), lambda: points and received(found, 1),
               "detections")
     scan = to_point_cloud(message(1), 0.0)[0]
     segmented = segment_cloud(scan, None, with_values(PipelineParams(),
@@ -117,7 +117,7 @@ def test_no_cloud_ends_the_detector_and_each_has_its_reason(talker, found, share
         assert len(received(found, 8)) == 0
         peer.wait_for_diagnostics(NODE, "threshold in pointnet.scores")
         peer.wait(lambda: "Car 0." in (peer.get_value(NODE, "best scores") or ""), "the scores")
-    log = shared_processes.log(NODE)
+    log = shared_processes.read_log(NODE)
     assert "Traceback" not in log and "Warning" not in log
 
 
@@ -143,7 +143,7 @@ def test_weights_that_cannot_be_used_are_a_diagnostic(shared_processes, peer, tm
     for i, (make, _) in enumerate(UNUSABLE.values()):
         shared_processes.fresh = make is missing_weights
         shared_processes.start(NODE, REMAP, {"pointnet.weights": str(make(tmp_path))}, f"bad{i}")
-    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
+    talker, found = peer.advertise("/in", CLOUD), peer.listen("/found", MARKERS)
     for i, (make, words) in enumerate(UNUSABLE.values()):
         peer.send(talker, message(1), lambda n=f"bad{i}/{NODE}", w=words: w in peer.get_message(n),
                   words)
@@ -153,7 +153,7 @@ def test_weights_that_cannot_be_used_are_a_diagnostic(shared_processes, peer, tm
         if make is missing_weights and maps.is_file():
             assert "libtorch" not in maps.read_text()  # which takes seconds and 200 MB
         assert not shared_processes.has_ended(node)
-        assert "Traceback" not in shared_processes.log(node)
+        assert "Traceback" not in shared_processes.read_log(node)
 
 
 def test_help_knows_the_node(capsys):

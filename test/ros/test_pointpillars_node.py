@@ -52,7 +52,7 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
     times = {step: peer.listen(f"/{NODE}/debug/{step}_ms", "std_msgs/msg/Float64")
              for step in STEPS}
     peer.wait_for_diagnostics(NODE, "waiting for input")
-    peer.send(peer.talker(POINTS, CLOUD), message(1), lambda: points and received(found, 1),
+    peer.send(peer.advertise(POINTS, CLOUD), message(1), lambda: points and received(found, 1),
               "detections")
 
     params = with_values(PipelineParams(), read_config(EXPERTS, PipelineParams()))
@@ -112,7 +112,7 @@ def test_no_cloud_ends_the_detector_and_each_has_its_reason(talker, found, share
         peer.send(talker, msg, lambda w=words: w in peer.get_message(NODE), f"'{words}': {name}")
     peer.send(talker, message(7), lambda: received(found, 7), "detections of a good cloud")
     assert_equal(received(found, 7), offline(weights, message(7)))
-    log = shared_processes.log(NODE)
+    log = shared_processes.read_log(NODE)
     assert "Traceback" not in log and "Warning" not in log
 
 
@@ -122,7 +122,7 @@ def test_thresholds_change_at_run_time_and_what_cannot_is_refused(talker, found,
                                ("pointpillars.version", "v0", "read-only"),
                                ("pointpillars.scores.car", 1.5, ""),
                                ("ground.method", "dream", "patchwork")]:
-        reason, = peer.change(f"/{NODE}", {name: value})
+        reason, = peer.set_parameters(f"/{NODE}", {name: value})
         assert reason and words in reason
     described, = peer.call(f"/{NODE}/describe_parameters", DescribeParameters,
                            DescribeParameters.Request(names=["pointpillars.scores.car"])).descriptors
@@ -176,7 +176,7 @@ def unusable(shared_processes, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def to_unusable(peer):
-    return peer.talker("/in", CLOUD)
+    return peer.advertise("/in", CLOUD)
 
 
 @pytest.mark.parametrize("case", UNUSABLE)
@@ -188,7 +188,7 @@ def test_weights_that_cannot_be_used_are_a_diagnostic(case, unusable, to_unusabl
     peer.diagnostics.clear()
     peer.wait(lambda: words in peer.get_message(node), "the diagnostic again")
     log = node.replace("/", ".")
-    assert not shared_processes.has_ended(log) and "Traceback" not in shared_processes.log(log)
+    assert not shared_processes.has_ended(log) and "Traceback" not in shared_processes.read_log(log)
 
 
 def test_without_weights_the_node_lives_says_so_and_finds_nothing(processes, shared_peer,

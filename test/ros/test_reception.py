@@ -112,7 +112,7 @@ def test_an_ordinary_driver(processes, peer):
 def test_the_newest_cloud_wins_and_the_others_are_counted(processes, peer):
     """A burst while a node works on a large cloud; a second publisher is said."""
     processes.start(NODE, {"~/input/points": "/in"}, {"ground.method": "patchwork"})
-    talker, rng = peer.talker("/in", CLOUD), np.random.default_rng(0)
+    talker, rng = peer.advertise("/in", CLOUD), np.random.default_rng(0)
     large, *small = (encode(cloud(rng.uniform(-50, 50, (n, 3)) * [1, 1, 0.05], stamp))
                      for stamp, n in enumerate([1_000_000, *[2000] * 40], start=2))
     peer.wait(talker.get_subscription_count, "the node")
@@ -127,7 +127,7 @@ def test_the_newest_cloud_wins_and_the_others_are_counted(processes, peer):
 
     peer.wait(lambda: sum(accounted()) == 42, "an account of every cloud")
     assert accounted()[0] < 30
-    other = peer.talker("/in", CLOUD)
+    other = peer.advertise("/in", CLOUD)
     peer.wait(lambda: "2 publishers on /in (/peer, /peer)" in peer.get_message(NODE), "a warning")
     peer.node.destroy_publisher(other)
     peer.wait(lambda: "publishers" not in peer.get_message(NODE), "no warning")
@@ -146,10 +146,10 @@ def two_sensors(shared_processes):
 def test_two_sensors_in_namespaces(two_sensors, shared_peer):
     """The same graph twice: no topic is shared, and the diagnostics tell which sensor it is."""
     peer = shared_peer
-    talkers = {side: peer.talker(f"/{side}/points", CLOUD) for side in SIDES}
+    talkers = {side: peer.advertise(f"/{side}/points", CLOUD) for side in SIDES}
     found = {side: peer.listen(f"/{side}/candidate_refinement/output/detections", MARKERS)
              for side in SIDES}
-    click = peer.talker("/right/clicked_point", "geometry_msgs/msg/PointStamped")
+    click = peer.advertise("/right/clicked_point", "geometry_msgs/msg/PointStamped")
     peer.wait(click.get_subscription_count, "the clicked points of one")
     street = np.random.default_rng(0).uniform(-20, 20, (5000, 3)) * [1, 1, 1e-3] - [0, 0, 1.73]
     for i, (side, talker) in enumerate(talkers.items()):
@@ -255,7 +255,7 @@ def test_as_many_clouds_wait_at_the_middleware_as_may_wait(start):
 def test_a_topic_that_is_not_latched_where_it_must_be_is_said_with_the_remedy(peer, start):
     node = start(GroundSegmentation)
     node.input("/static", TEXT, lambda _: None, LATCHED, private=False)
-    peer.talker("/static", TEXT, RELIABLE_QOS)
+    peer.advertise("/static", TEXT, RELIABLE_QOS)
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     peer.wait(lambda: [executor.spin_once(0.0), "transient local" in node.state[1]][1],

@@ -20,7 +20,7 @@ from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import read_column, to_detections, to_point_cloud
 from lidar_perception.wire.topics import POINTS
 from msg_utils.markers import from_marker_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
@@ -42,7 +42,7 @@ def test_a_cropped_cloud_over_dds_is_the_cropped_frame_offline(processes, peer, 
     processes.start("ground_segmentation", {"~/input/points": "/in"}, values)
     found = peer.listen("/perception/output/detections", MARKERS)
     clouds = peer.listen("/ground_segmentation/output/points", CLOUD)
-    talker = peer.talker("/in", CLOUD)
+    talker = peer.advertise("/in", CLOUD)
     peer.send(talker, cloud, lambda: found and clouds, "both results")
     frame, usable = to_point_cloud(cloud)
     segmented, candidates = find_candidates(frame, make_fixed_source(load_seed("")), params=params)
@@ -71,15 +71,15 @@ def test_a_tilted_sensor_gets_its_mounting_from_tf(processes, peer):
     xyz, person = walker(base)
     processes.start("perception", {"~/input/points": "/in"}, {
         **WALKING, "base_frame": "base", "target_frame": "odom"})
-    static = peer.talker("/tf_static", TF_MESSAGE, STATIC_QOS)
+    static = peer.advertise("/tf_static", TF_MESSAGE, STATIC_QOS)
     static.publish(encode(transforms(("base", "lidar", base, 0))))
-    moving = peer.talker("/tf", TF_MESSAGE)
-    click = peer.talker("/clicked_point", "geometry_msgs/msg/PointStamped")
+    moving = peer.advertise("/tf", TF_MESSAGE)
+    click = peer.advertise("/clicked_point", "geometry_msgs/msg/PointStamped")
     found = peer.listen("/perception/output/detections", MARKERS)
-    talker = peer.talker("/in", CLOUD)
+    talker = peer.advertise("/in", CLOUD)
     at = (person + moved[:3, 3]).tolist()
     peer.send(click, bag_message(
-        "geometry_msgs/msg/PointStamped", header=header_message(START, "odom", bag_message),
+        "geometry_msgs/msg/PointStamped", header=make_header(START, "odom", bag_message),
         point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at)))),
         click.get_subscription_count, "a subscriber of the click")
     early, late = (transforms(("odom", "base", moved, START + i * PERIOD)) for i in (-1, 1))

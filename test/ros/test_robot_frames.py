@@ -28,7 +28,7 @@ from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.messages import to_detections
 from msg_utils.markers import from_marker_array
 from msg_utils.point_cloud2 import from_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 START = 1_700_000_000 * 10**9
 PERIOD = 10**8
@@ -48,7 +48,7 @@ def message(xyz, stamp=START, intensity=None, frame_id="lidar", **columns):
     points["intensity"] = 0.3 if intensity is None else intensity
     for name, values in columns.items():
         points[name] = values
-    return from_array(points, header_message(stamp, frame_id, bag_message), bag_message)
+    return from_array(points, make_header(stamp, frame_id, bag_message), bag_message)
 
 
 def transforms(*rows):
@@ -59,7 +59,7 @@ def transforms(*rows):
 def odometry(pose, stamp, child="base", frame="odom"):
     t, q = pose[:3, 3].tolist(), Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
     found = bag_message("nav_msgs/msg/Odometry", child_frame_id=child,
-                        header=header_message(stamp, frame, bag_message))
+                        header=make_header(stamp, frame, bag_message))
     for name, value in zip("xyz", t):
         setattr(found.pose.pose.position, name, value)
     for name, value in zip("xyzw", q):
@@ -108,7 +108,7 @@ def test_candidates_of_a_tilted_sensor_are_those_of_a_level_one(start, tilt):
         xyz, person = walker(base)
         at = transform_points(person[None], invert_pose(camera))[0].tolist()
         node.seed._on_click(bag_message(
-            "geometry_msgs/msg/PointStamped", header=header_message(START, "eye", bag_message),
+            "geometry_msgs/msg/PointStamped", header=make_header(START, "eye", bag_message),
             point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at)))))
         give(node, message(xyz))
         detections, frame_id, stamp = boxes_of(node)
@@ -201,7 +201,7 @@ def test_a_click_and_candidates_are_where_they_are_in_a_turned_cloud(start):
     xyz, person = transform_points(walker_scene()[:, :3].astype(np.float64), turn), WALKER[:3]
     at = transform_points(np.array(person, np.float64)[None], turn)[0]
     node.seed._on_click(bag_message(
-        "geometry_msgs/msg/PointStamped", header=header_message(START, "lidar", bag_message),
+        "geometry_msgs/msg/PointStamped", header=make_header(START, "lidar", bag_message),
         point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at.tolist())))))
     give(node, message(xyz))
     detections, frame_id, _ = boxes_of(node)

@@ -149,7 +149,7 @@ def test_a_costmap_gets_the_obstacles_of_each_cloud(processes, peer, drive_bag):
     for node in ("ground_segmentation", "perception"):
         processes.start(node, {"~/input/points": "/in"}, band)
         heard[node] = peer.listen(f"/{node}/output/obstacles", CLOUD, NAV2_QOS)
-    talker = peer.talker("/in", CLOUD)
+    talker = peer.advertise("/in", CLOUD)
     peer.wait(lambda: talker.get_subscription_count() == 2, "both nodes")
     peer.send(talker, cloud, lambda: all(heard.values()), "obstacles of both")
     frame, indices = to_point_cloud(cloud)

@@ -34,7 +34,7 @@ from lidar_perception.wire.messages import (
 from lidar_perception.wire.topics import CAMERA_INFO, ODOMETRY, POINTS, TRUTH
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import ADD, from_marker_array
-from msg_utils.stamps import header_message, to_ns
+from msg_utils.stamps import make_header, to_ns
 
 NODE, ODOMETRY_TYPE = "tracker", "nav_msgs/msg/Odometry"
 REMAP = {"~/input/detections": "/found", "~/output/tracks": "/tracks",
@@ -44,7 +44,7 @@ DELETEALL = 3
 
 
 def header(stamp, frame_id="lidar"):
-    return header_message(stamp, frame_id, bag_message)
+    return make_header(stamp, frame_id, bag_message)
 
 
 def poses_of(path):
@@ -154,8 +154,8 @@ def test_in_one_process_with_the_detector_the_library_tracks_too(looped, drive_b
 
 def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes, peer):
     processes.start(NODE, REMAP, {})
-    talker, tracks = peer.talker("/found", MARKERS), peer.listen("/tracks", MARKERS)
-    moving, now = peer.talker("/moved", ODOMETRY_TYPE), START
+    talker, tracks = peer.advertise("/found", MARKERS), peer.listen("/tracks", MARKERS)
+    moving, now = peer.advertise("/moved", ODOMETRY_TYPE), START
     peer.wait(lambda: peer.get_message(NODE) and talker.get_subscription_count()
               and moving.get_subscription_count(), "the tracker")
 

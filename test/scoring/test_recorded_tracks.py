@@ -18,7 +18,7 @@ from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_truth_markers
 from lidar_perception.wire.topics import TRUTH
 from lidar_perception.wire.track_markers import make_track_markers, read_trails
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 MARKERS, TRACKS = "visualization_msgs/msg/MarkerArray", "/tracker/output/tracks"
 
@@ -32,7 +32,7 @@ def recorded(request, tmp_path):
             bag.add_topic(topic, MARKERS)
         for i, found in enumerate(crowd()):
             stamp = START + i * TENTH
-            header = header_message(stamp, "velodyne", bag_message)
+            header = make_header(stamp, "velodyne", bag_message)
             tracks = tracker(found, stamp)
             extras = [{"track_id": k, "occluded": 0, "truncated": 0.0} if request.param else {}
                       for k in range(len(found))]

@@ -20,7 +20,7 @@ from lidar_studio.live import BOXES, LABELS, TRACKS, Live
 from lidar_studio.live_topics import box_topics, clouds_topic
 from msg_utils.markers import MarkedObjects, from_marker_array
 from msg_utils.point_cloud2 import from_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
 ARRAY = "vision_msgs/msg/Detection3DArray"
@@ -33,7 +33,7 @@ def cloud(stamp, points=50):
     found["x"] = 1 + np.arange(points)
     found["ground"], found["cluster_id"] = 1, 0
     found["ground"][:10], found["cluster_id"][:10] = 0, 7_000_000
-    return from_array(found, header_message(stamp, "velodyne", bag_message), bag_message)
+    return from_array(found, make_header(stamp, "velodyne", bag_message), bag_message)
 
 
 def boxes(stamp, frame_id="velodyne", x=5.0, ids=(3,)):
@@ -160,7 +160,7 @@ def test_boxes_in_another_frame_are_those_of_the_clouds_once_tf_has_come(live, m
         found = Detections.of(transform_boxes(boxes(stamp).boxes, pose), [0], [0.5])
         tracks = make_track_markers(np.array([3]), found, np.zeros((1, 2)), np.zeros(1),
                                     [transform_points(trail, pose)],
-                                    header_message(stamp, "odom", bag_message), bag_message)
+                                    make_header(stamp, "odom", bag_message), bag_message)
         live.boxes(TRACKED, from_marker_array(tracks), tracks)
         if i:
             live.boxes(FOUND, boxes(stamp), None)

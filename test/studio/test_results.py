@@ -36,7 +36,7 @@ from lidar_studio.results import (
     with_recorded_scans,
 )
 from msg_utils.markers import MarkedObjects, to_marker_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 VAN = CLASSES.index("Van")
 CARS = np.array([[10.0, 0, -1, 4, 1.6, 1.5, 0.3], [20.0, 4, -1, 4, 1.6, 1.5, 2.0]])
@@ -148,7 +148,7 @@ def test_tracks_of_all_trackers_in_a_bag_keep_apart(tmp_path):
             made.add_topic(topic, "visualization_msgs/msg/MarkerArray")
             made.write(topic, 10, to_marker_array(
                 np.tile([5.0, 0, 0, 1, 1, 1, 0], (2, 1)), ["Car"] * 2, ids=ids,
-                header=header_message(10, "velodyne", bag_message), make=bag_message))
+                header=make_header(10, "velodyne", bag_message), make=bag_message))
     found = recorded(BagPoses(BagHandle(tmp_path / "bag"), ""), [10]).tracks
     assert len({t["id"] for t in found}) == len(found) == 4
     assert {t["source"] for t in found} == {"a", "b"}

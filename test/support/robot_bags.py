@@ -7,14 +7,14 @@ from lidar_perception.data.bag import BagWriter
 from lidar_perception.data.frame import POSES
 from lidar_perception.data.open import open_recording
 from lidar_perception.robot.placement import make_tilted_pose
-from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_odometry
 from lidar_perception.wire.topics import POINTS, TF, TF_STATIC
 from lidar_perception.wire.transforms import ODOMETRY_MESSAGE, TF_MESSAGE
-from msg_utils.stamps import SECOND, header_message
+from msg_utils.stamps import SECOND_NS, make_header
 
-START, CLOUDS = 1_700_000_000 * SECOND, 5
+START, CLOUDS = 1_700_000_000 * SECOND_NS, 5
 ON_BASE = make_tilted_pose(0.02, -0.05, 1.1)  # pose of the sensor in base_link
 ON_BASE[:3, :3] = ON_BASE[:3, :3] @ Rotation.from_euler("z", 90, degrees=True).as_matrix()
 ON_BASE[0, 3] = 0.4
@@ -22,7 +22,7 @@ ON_BASE[0, 3] = 0.4
 
 def base_at(stamp):
     """Return the pose of the base in odom, on a curve."""
-    t = (stamp - START) / SECOND
+    t = (stamp - START) / SECOND_NS
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("z", 0.3 * t).as_matrix()
     pose[:3, 3] = 5 * t, 0.7 * t, 0
@@ -31,13 +31,13 @@ def base_at(stamp):
 
 def stamps():
     """Return the stamps of the clouds, which are between those of the odometry."""
-    return [START + round((0.1 * i + 0.003) * SECOND) for i in range(CLOUDS)]
+    return [START + round((0.1 * i + 0.003) * SECOND_NS) for i in range(CLOUDS)]
 
 
 def transform(parent, child, stamp, pose):
     x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
     return bag_message("geometry_msgs/msg/TransformStamped", child_frame_id=child,
-                       header=header_message(stamp, parent, bag_message),
+                       header=make_header(stamp, parent, bag_message),
                        transform=bag_message(
         "geometry_msgs/msg/Transform",
         translation=bag_message("geometry_msgs/msg/Vector3", **dict(zip("xyz", pose[:3, 3]))),
@@ -51,15 +51,15 @@ def tf(*transforms):
 def moving(topic, child="base_link", seconds=CLOUDS / 10):
     """Yield odometry every 20 ms."""
     for i in range(-2, round(50 * seconds) + 1):
-        stamp = START + i * SECOND // 50
+        stamp = START + i * SECOND_NS // 50
         yield topic, ODOMETRY_MESSAGE, stamp, make_odometry(
-            base_at(stamp), header_message(stamp, "odom", bag_message), child, bag_message)
+            base_at(stamp), make_header(stamp, "odom", bag_message), child, bag_message)
 
 
 def moving_tf(seconds=CLOUDS / 10):
     """Yield map -> odom -> base_link every 20 ms; the map frame jumps."""
     for i in range(-2, round(50 * seconds) + 1):
-        stamp = START + i * SECOND // 50
+        stamp = START + i * SECOND_NS // 50
         jump = make_tilted_pose(0, 0, i % 2)
         yield TF, TF_MESSAGE, stamp, tf(transform("map", "odom", stamp, jump),
                                         transform("odom", "base_link", stamp, base_at(stamp)))
@@ -72,7 +72,7 @@ def mount(parent="base_link", pose=ON_BASE):
 
 def point(stamp):
     """Return a cloud of one point."""
-    return cloud_message(np.ones((3, 4)), stamp, "lidar")
+    return make_cloud_message(np.ones((3, 4)), stamp, "lidar")
 
 
 def recorded(path, *parts, cloud=point):

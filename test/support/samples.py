@@ -18,8 +18,8 @@ from lidar_perception.data.kitti.labels import format_label, to_labels
 from lidar_perception.data.kitti.write import write_object
 from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, PointCloud
 from lidar_perception.wire.codec import bag_message
-from msg_utils.messages import ros_message
-from msg_utils.stamps import header_message
+from msg_utils.messages import make_ros_message
+from msg_utils.stamps import make_header
 
 
 def for_all(cases):
@@ -43,7 +43,7 @@ def for_all(cases):
 # Both kinds of message classes: rosbags' own, and ROS's.
 each_make = pytest.mark.parametrize("make", [
     pytest.param(bag_message, id="rosbags"),
-    pytest.param(ros_message, id="ros", marks=pytest.mark.skipif(
+    pytest.param(make_ros_message, id="ros", marks=pytest.mark.skipif(
         importlib.util.find_spec("rclpy") is None, reason="needs ROS 2, or the extra [ros]")),
 ])
 
@@ -73,7 +73,7 @@ DontCare -1 -1 -10 503.89 169.71 590.61 190.13 -1 -1 -1 -1000 -1000 -1000 -10
 
 
 def header(make, ns: int = STAMP, frame_id: str = "velodyne"):
-    return header_message(ns, frame_id, make)
+    return make_header(ns, frame_id, make)
 
 
 def scene(seed: int = 0) -> np.ndarray:

@@ -15,7 +15,7 @@ from lidar_perception.simulation.sensor import Motion, Sensor, rays, sensor_name
 from lidar_perception.simulation.terrain import Ground, cast_ground, compiled, surface_height
 from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 # Columns of a driver: name, type and scale.
 VELODYNE = dict(intensity=("intensity", "<f4", 255), ring=("ring", "<u2", -1),
@@ -117,7 +117,7 @@ def make_cloud(returns, driver: dict, stamp_ns: int, rings: int, frame_id: str =
     points = np.empty(len(order), kinds)
     for name, values in columns.items():
         points[name] = values
-    return from_array(points, header_message(stamp_ns, frame_id, bag_message), bag_message)
+    return from_array(points, make_header(stamp_ns, frame_id, bag_message), bag_message)
 
 
 def simulate_clouds(name: str, count: int = 4, even: bool = True, street: int = 40):

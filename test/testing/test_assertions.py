@@ -11,10 +11,10 @@ from samples import each_make, header, scene, walker_truth
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
 from lidar_perception.nodes.graph import reserve_domain
-from lidar_perception.testing.bags import recording
-from lidar_perception.testing.clouds import cloud_message
-from lidar_perception.testing.detections import assert_detections, objects_of
-from lidar_perception.testing.launching import description, launch_file
+from lidar_perception.testing.bags import make_frames
+from lidar_perception.testing.clouds import make_cloud_message
+from lidar_perception.testing.detections import assert_detections, to_objects
+from lidar_perception.testing.launching import include_launch_file, make_description
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import (
@@ -42,7 +42,7 @@ def pairs_of(objects):
 @each_make
 def test_every_kind_of_detections_says_the_same(make):
     found = some(np.random.default_rng(0), 7)
-    expected = objects_of(found)
+    expected = to_objects(found)
     truth = GroundTruth.of(found.boxes, found.class_ids)
     kinds = [make_detection_markers(found, header(make), make),
              make_truth_markers(truth, header(make), make), truth, expected, pairs_of(expected)]
@@ -50,7 +50,7 @@ def test_every_kind_of_detections_says_the_same(make):
         kinds.append(to_detection_array(found.boxes, expected.labels, found.scores,
                                         header=header(make), make=make))
     for kind in kinds:
-        objects = objects_of(kind)
+        objects = to_objects(kind)
         assert objects.labels == expected.labels
         np.testing.assert_allclose(objects.boxes, expected.boxes, atol=1e-6)
         for limit in {"max_distance": 1e-3}, {"min_iou": 0.99}:
@@ -93,13 +93,13 @@ def test_as_many_pairs_as_possible_and_a_class_is_a_class():
 
 
 @pytest.mark.parametrize("found, words", [
-    (3, "int is no MarkerArray"), ([("Car", [1, 2])], "list is no MarkerArray"),
-    (["Car"], "is no MarkerArray"),
+    (3, "int is not a MarkerArray"), ([("Car", [1, 2])], "list is not a MarkerArray"),
+    (["Car"], "is not a MarkerArray"),
 ])
 def test_what_is_no_detection_is_refused(found, words):
     with pytest.raises(InputError, match=words):
         assert_detections(found, [])
-    with pytest.raises(InputError, match="min_iou needs whole boxes"):
+    with pytest.raises(InputError, match="min_iou needs complete boxes"):
         assert_detections([], [("Car", [1, 2, 3])], min_iou=0.5)
 
 
@@ -123,9 +123,9 @@ def test_a_bag_gives_back_its_arrays(make_bag, storage):
     ([np.zeros((5, 2))], None, {}, r"cloud 0 has shape \(5, 2\)"),
     ([scene()], [], {}, "1 clouds and labels of 0"),
     ([scene()], [[("Dragon", [0] * 7)]], {}, "'Dragon' is none of Car"),
-    ([scene()], [[("Car", [0] * 3)]], {}, "whole boxes"),
+    ([scene()], [[("Car", [0] * 3)]], {}, "complete boxes"),
     ([scene()], None, {"storage": "tape"}, "'tape' is none of mcap, sqlite3"),
-    (recording([scene()]), [None], {"hz": 5.0}, "they take no labels and no hz"),
+    (make_frames([scene()]), [None], {"hz": 5.0}, "they take no labels and no hz"),
 ])
 def test_a_bag_that_cannot_be_made_is_refused_by_name(make_bag, clouds, labels, options, words):
     with pytest.raises(InputError, match=words):
@@ -134,20 +134,20 @@ def test_a_bag_that_cannot_be_made_is_refused_by_name(make_bag, clouds, labels, 
 
 def test_a_cloud_message_holds_its_columns():
     ring = np.arange(3400, dtype=np.uint16) % 64
-    points = to_array(cloud_message(scene(), 7, ring=ring))
+    points = to_array(make_cloud_message(scene(), 7, ring=ring))
     assert np.array_equal(points["ring"], ring) and points.dtype["ring"] == np.uint16
     assert np.array_equal(points["intensity"], scene()[:, 3])
     with pytest.raises(InputError, match="must be"):
-        cloud_message(np.zeros(3))
+        make_cloud_message(np.zeros(3))
 
 
 def test_without_launch_it_says_what_is_missing(monkeypatch):
     for module in ("launch", "launch.actions", "launch.launch_description", "launch_testing"):
         monkeypatch.setitem(__import__("sys").modules, module, None)
-    for call in description, launch_file:
+    for call in make_description, include_launch_file:
         with pytest.raises(InputError, match=r"launch.* is not installed; it comes with ROS 2"):
             call()
 
 
-def test_a_private_domain_stays_private_while_nothing_runs_there():
+def test_a_reserved_domain_stays_private_while_nothing_runs_there():
     assert len({reserve_domain() for _ in range(5)}) == 5

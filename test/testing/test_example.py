@@ -55,9 +55,9 @@ def test_the_whole_test_passes_and_a_failure_says_what_was_seen(folder):
                "test_broken.py")
     said = " ".join(done.stdout.split())
     assert "2 failed, 3 passed" in said, done.stdout
-    for words in ("while the test waited for a miracle, there ended speaker with code 3",
+    for words in ("while the test waited for a miracle, speaker ended with code 3",
                   "log of speaker, which ended with code 3", "I am tired",
-                  "in vain for 2 messages on /nowhere; diagnostics: none came; heard: /nowhere "
+                  "in vain for 2 messages on /nowhere; diagnostics: none; received: /nowhere "
                   "nothing from 0 publishers"):
         assert words in said, done.stdout
 

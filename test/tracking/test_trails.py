@@ -12,7 +12,7 @@ from lidar_perception.tracking.trails import TRAIL_POINTS, Trails
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.codec import bag_message, decode, encode
 from msg_utils.detections import to_detection_array
-from msg_utils.stamps import header_message
+from msg_utils.stamps import make_header
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.55, 2.0])
@@ -67,7 +67,7 @@ def test_a_detection_array_has_the_ids_and_covariances_of_the_tracks(tracks):
     array = to_detection_array(
         found.boxes, [CLASSES[i] for i in found.class_ids], found.scores, ids=tracks.ids + 40,
         covariances=tracks.pose_covariances(), make=bag_message,
-        header=header_message(START, "lidar", bag_message))
+        header=make_header(START, "lidar", bag_message))
     read = decode(encode(array), "vision_msgs/msg/Detection3DArray")
     assert [d.id for d in read.detections] == [str(i + 40) for i in tracks.ids.tolist()]
     for detection, square in zip(read.detections, tracks.pose_covariances(), strict=True):

@@ -21,7 +21,7 @@ from lidar_perception.wire.messages import (
     to_point_cloud,
 )
 from lidar_perception.wire.topics import CAMERA_FRAME
-from msg_utils.messages import message_class, ros_message
+from msg_utils.messages import load_message_class, make_ros_message
 from msg_utils.point_cloud2 import from_array
 
 
@@ -86,10 +86,10 @@ MESSAGES = {
 @pytest.mark.parametrize("build", MESSAGES.values(), ids=MESSAGES)
 def test_ros_and_rosbags_read_each_others_bytes(build):
     serialization = pytest.importorskip("rclpy.serialization", reason="needs rclpy")
-    ours, theirs = build(bag_message), build(ros_message)
+    ours, theirs = build(bag_message), build(make_ros_message)
     name = ours.__msgtype__
     raw = serialization.serialize_message(theirs)
-    as_ros = message_class(name)
+    as_ros = load_message_class(name)
     assert serialization.deserialize_message(
         encode(ours), as_ros) == serialization.deserialize_message(raw, as_ros)
     assert encode(decode(raw, name)) == encode(ours)
@@ -100,11 +100,11 @@ def test_ros_and_rosbags_read_each_others_bytes(build):
                                   "diagnostic_msgs/msg/DiagnosticArray"])
 def test_message_fields_default_to_zero_as_in_ros(name):
     serialization = pytest.importorskip("rclpy.serialization", reason="needs rclpy")
-    theirs = ros_message(name)
+    theirs = make_ros_message(name)
     if name.endswith(("Pose", "Marker")):  # ROS starts at the unit quaternion
         pose = theirs if name.endswith("Pose") else theirs.pose
         pose.orientation.w = 0.0
-    got = serialization.deserialize_message(encode(bag_message(name)), message_class(name))
+    got = serialization.deserialize_message(encode(bag_message(name)), load_message_class(name))
     assert got == theirs
 
 

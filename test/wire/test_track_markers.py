@@ -18,7 +18,7 @@ from lidar_perception.wire.track_markers import (
     VELOCITY,
     make_track_markers,
 )
-from msg_utils.markers import ADD, DELETE, from_marker_array, marker_keys
+from msg_utils.markers import ADD, DELETE, from_marker_array, list_marker_keys
 
 
 def make_frames(make, frames=20):
@@ -31,7 +31,7 @@ def make_frames(make, frames=20):
             tracks.ids, tracks.detections, tracks.velocities, tracks.moving,
             trails(tracks, tracker.pose, stamp, 2.0), header(make, stamp), make, previous=shown,
             lifetime_ns=10**9)
-        shown = marker_keys(message)
+        shown = list_marker_keys(message)
         yield tracks, message
 
 
@@ -63,8 +63,8 @@ def test_each_array_deletes_outdated_markers(make):
     before = frozenset()
     for _, message in make_frames(make, 60):
         deleted = {(m.ns, m.id) for m in message.markers if m.action == DELETE and m.ns}
-        assert deleted == before - marker_keys(message)
-        before = marker_keys(message)
+        assert deleted == before - list_marker_keys(message)
+        before = list_marker_keys(message)
     assert not before and message.markers  # an array without boxes still has a stamp
 
 

@@ -24,8 +24,8 @@ from lidar_perception.types import InputError, InputWarning
 from lidar_perception.wire.clouds import POINT_CLOUD, decode_cloud, find_cloud_topics
 from lidar_perception.wire.codec import encode
 from lidar_perception.wire.transforms import TF_MESSAGE
-from msg_utils.messages import ros_message
-from msg_utils.stamps import SECOND, time_message
+from msg_utils.messages import make_ros_message
+from msg_utils.stamps import SECOND_NS, make_time
 
 SERVICE_PERIOD_S = 0.05  # between calls of services while messages are late
 MIN_LOOP_S = 0.1
@@ -60,12 +60,12 @@ class BagPlayer(LidarNode):
                              f"{', '.join(self.bag.topics) or 'an empty bag'}")
         self.awaited = self._parse_wait_for()
         self.diagnostic_values: dict[str, dict[str, str]] = {}  # by node
-        self.start_ns = self.bag.start_ns + int(self.params.start_offset * SECOND)
+        self.start_ns = self.bag.start_ns + int(self.params.start_offset * SECOND_NS)
         if self.start_ns > self.bag.end_ns:
             raise InputError(f"start_offset {self.params.start_offset:g} s is after the end of "
                              f"{self.params.bag}, which has "
-                             f"{(self.bag.end_ns - self.bag.start_ns) / SECOND:.1f} s")
-        self.stop_ns = (self.start_ns + int(self.params.duration * SECOND)
+                             f"{(self.bag.end_ns - self.bag.start_ns) / SECOND_NS:.1f} s")
+        self.stop_ns = (self.start_ns + int(self.params.duration * SECOND_NS)
                         if self.params.duration else None)
         self.paused = self.params.start_paused
         self.warned: set[str] = set()  # topics with skipped messages
@@ -248,7 +248,7 @@ class BagPlayer(LidarNode):
 
     def _count_pace(self) -> None:
         if self.params.follow:
-            played = max((self.now_ns - self.start_ns) / SECOND / self.params.rate, 1e-9)
+            played = max((self.now_ns - self.start_ns) / SECOND_NS / self.params.rate, 1e-9)
             self.counts.update(unanswered=self.pace.unanswered, held_s=f"{self.pace.held:.2f}",
                                slower=f"{(played + self.pace.held) / played:.2f}")
 
@@ -272,7 +272,7 @@ class BagPlayer(LidarNode):
                 self.now_ns = stamp
                 self.steps -= topic == self.step_topic
                 return True
-            behind = (stamp - self.now_ns) / SECOND / self.params.rate
+            behind = (stamp - self.now_ns) / SECOND_NS / self.params.rate
             late = behind <= 0 and not self.paused
             if late and monotonic() - self.served_at < SERVICE_PERIOD_S:
                 return True  # otherwise serve first, however far behind the replay is
@@ -287,7 +287,7 @@ class BagPlayer(LidarNode):
         """Advance the time of the bag by the elapsed time at the present rate."""
         now = monotonic()
         if not self.paused:
-            self.now_ns += int((now - self.anchor) * self.params.rate * SECOND)
+            self.now_ns += int((now - self.anchor) * self.params.rate * SECOND_NS)
         self.anchor = now
         self._publish_clock()
 
@@ -295,7 +295,7 @@ class BagPlayer(LidarNode):
         now = monotonic()
         if self.clock and now >= self.next_clock:
             self.next_clock = max(self.next_clock + 1 / self.params.clock_hz, now)
-            self.clock.publish(Clock(clock=time_message(self.now_ns, ros_message)))
+            self.clock.publish(Clock(clock=make_time(self.now_ns, make_ros_message)))
 
     def _pause(self, _: Any, response: Any) -> Any:
         self._advance()

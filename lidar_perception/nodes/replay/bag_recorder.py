@@ -14,7 +14,7 @@ from lidar_perception.nodes.runtime import OK, WARN, LidarNode
 from lidar_perception.params import RecorderParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import load_typestore
-from msg_utils.messages import message_class
+from msg_utils.messages import load_message_class
 
 LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
 DEPTH = 100  # messages of a topic that DDS holds while the machine is busy
@@ -89,7 +89,7 @@ class BagRecorder(LidarNode):
         if type_name not in load_typestore().fielddefs:
             return None
         try:
-            return message_class(type_name)
+            return load_message_class(type_name)
         except (ModuleNotFoundError, AttributeError):
             return None
 

@@ -7,7 +7,7 @@ from time import monotonic
 from typing import Any
 
 from lidar_perception.nodes.runtime import MARKERS, RELIABLE
-from msg_utils.messages import message_class
+from msg_utils.messages import load_message_class
 
 SHORT_TIMEOUT_S = 1.0  # for a detection, after one has timed out
 
@@ -32,7 +32,7 @@ class Pace:
         self.unanswered, self.held = 0, 0.0
         self.topics = frozenset(topics)
         for topic in topics:
-            node.create_subscription(message_class(MARKERS), topic,
+            node.create_subscription(load_message_class(MARKERS), topic,
                                      lambda data, t=topic: self.add_answer(data[8:16], t), RELIABLE,
                                      raw=True)  # CDR: 8 bytes, then the first marker's stamp
 

@@ -1,4 +1,4 @@
-"""Loads what nodes need, for processes that are forked from the one that imports this."""
+"""Imports the modules that nodes need, for processes forked from the one that imports this."""
 
 from contextlib import suppress
 from importlib import import_module
