@@ -217,6 +217,9 @@ class RecorderParams(Params):
 
     bag: str = param("", "Folder to make for the bag.", fixed=True)
     topics: tuple[str, ...] = param(str, "Topics to record.", fixed=True)
+    compression: str = param("zstd", "Compression of the bag: zstd (level 1), lz4, or none, which "
+                             "takes the least CPU time and the most disk.",
+                             choices=("zstd", "lz4", "none"), fixed=True)
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,12 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO, Any, cast
 
+import mcap.writer
 import yaml
+import zstandard
 from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Qos
 
@@ -35,6 +38,12 @@ __all__ = ["LATCHED_QOS", "SENSOR_QOS", "Bag", "BagHandle", "BagWriter"]
 # A KITTI cloud has 1.9 MB. Chunks of several clouds compress better and are read in fewer steps.
 CHUNK_BYTES = 8 * 2**20
 MAX_SHOWN = 3  # differences between metadata.yaml and the files that a warning lists
+COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4,
+                "none": CompressionType.NONE}
+# mcap always takes level 3 (mcap/writer.py, Writer.__finalize_chunk). Level 1 takes half the time
+# for a cloud and gives about the same size.
+_library: Any = mcap.writer
+_library.zstandard = SimpleNamespace(compress=partial(zstandard.compress, level=1))
 
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # faster, but optional
 
@@ -51,16 +60,21 @@ def _to_yaml(content: Any) -> str:
 
 
 class BagWriter:
-    """Writer of a rosbag2 folder with one MCAP file, zstd chunks, checksums and metadata.yaml.
+    """Writer of a rosbag2 folder with one MCAP file, checksums and metadata.yaml.
 
     A context manager. Only one process can write a bag at a time. The folder gets its name when it
     is complete. After an exception, the messages written so far are kept in a valid bag
     NAME.incomplete. InputError if the disk is full; NAME.incomplete then holds the messages that
     fit.
+
+    Args:
+        path: folder of the bag.
+        force: replace an existing bag.
+        compression: of the chunks, a key of COMPRESSIONS.
     """
 
-    def __init__(self, path: str | Path, *, force: bool = False):
-        self.path, self.force = Path(path), force
+    def __init__(self, path: str | Path, *, force: bool = False, compression: str = "zstd"):
+        self.path, self.force, self.compression = Path(path), force, COMPRESSIONS[compression]
         require_name(self.path)
         self.partial = self.path.with_name(self.path.name + ".incomplete")
         self.channels: dict[str, int] = {}
@@ -84,7 +98,7 @@ class BagWriter:
                 shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
             self.file = stack.enter_context(RecordFile(self.partial / f"{self.path.name}.mcap"))
             stream = cast(IO[bytes], self.file)  # mcap only calls write, tell and flush
-            self.mcap = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+            self.mcap = Writer(stream, chunk_size=CHUNK_BYTES, compression=self.compression)
             self.mcap.start(profile="ros2", library="lidar_perception")
             self.open = stack.pop_all()
         return self

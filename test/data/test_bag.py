@@ -7,11 +7,15 @@ import os
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 
+import lz4.frame
 import numpy as np
 import pytest
 import yaml
+import zstandard
 from bag_samples import LATCHED, cloud_frame, message_bytes, same_cloud, scans
 from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from samples import STAMP, png_header, scene, write
@@ -21,8 +25,10 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.testing.bags import copy_bag
+from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.types import GroundTruth, InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.compression import decompress
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, IMAGE, POINTS, TRUTH
 from msg_utils.point_cloud2 import to_array
 
@@ -117,6 +123,25 @@ def test_zstd_chunks_hold_several_clouds(tmp_path):
         chunks = make_reader(stream).get_summary().chunk_indexes
     assert {c.compression for c in chunks} == {"zstd"}
     assert 1 < len(chunks) < count / 2
+
+
+@pytest.mark.parametrize(("compression", "pack"), [
+    ("zstd", lambda data: zstandard.compress(data, level=1)), ("lz4", lz4.frame.compress),
+    ("none", bytes)])
+def test_bag_is_compressed_as_asked(tmp_path, compression, pack):
+    cloud = np.random.default_rng(0).normal(size=(2000, 4)).astype(np.float32)
+    data = encode(cloud_message(cloud))
+    with BagWriter(tmp_path / "bag", compression=compression) as bag:
+        bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
+        for i in range(3):
+            bag.write(POINTS, STAMP + i, data)
+    with open(tmp_path / "bag/bag.mcap", "rb") as stream:
+        chunk, = (record for record in StreamReader(stream, emit_chunks=True).records
+                  if isinstance(record, Chunk))
+    assert chunk.compression == compression.replace("none", "")
+    assert chunk.data == pack(decompress(chunk.data, chunk.compression, None))
+    with Bag(tmp_path / "bag") as bag:
+        assert [raw for *_, raw in bag.raw_messages({POINTS})] == 3 * [data]
 
 
 def test_calibrations_are_latched_and_clouds_are_not(written):

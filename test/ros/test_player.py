@@ -11,6 +11,7 @@ import pytest
 import yaml
 from bag_samples import as_ros1
 from cloud_samples import compressed_message, livox_message, livox_points
+from mcap.reader import make_reader
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
@@ -303,7 +304,7 @@ def test_what_cannot_be_played_is_one_line_and_exit_code_2(refused, shared_proce
 
 
 def test_the_recorder_writes_what_the_player_plays(processes, peer, text_bag, tmp_path):
-    processes.start("bag_recorder", {}, {"bag": str(tmp_path / "copy"),
+    processes.start("bag_recorder", {}, {"bag": str(tmp_path / "copy"), "compression": "lz4",
                                          "topics": ["/text", "/note"]})
     start(processes, text_bag, rate=2.0)  # the player keeps ten for whom is late
     peer.wait(lambda: processes.has_ended("bag_player")
@@ -313,6 +314,8 @@ def test_the_recorder_writes_what_the_player_plays(processes, peer, text_bag, tm
         assert [m.data for _, _, m in bag.messages({"/text"})] == [str(i) for i in range(20)]
         assert [m.data for _, _, m in bag.messages({"/note"})] == ["latched"]
         assert bag.qos("/note")[0].durability.name == "TRANSIENT_LOCAL"
+    with open(tmp_path / "copy/copy.mcap", "rb") as stream:
+        assert {c.compression for c in make_reader(stream).get_summary().chunk_indexes} == {"lz4"}
 
 
 def test_the_recorder_has_what_each_of_several_publishers_latched(processes, peer, tmp_path):

@@ -34,7 +34,7 @@ class BagRecorder(LidarNode):
         super().__init__("bag_recorder", RecorderParams(), **options)
         if not self.params.bag or not self.params.topics:
             raise InputError("parameters 'bag' and 'topics' must name the bag and its topics")
-        self.writer = BagWriter(self.params.bag)
+        self.writer = BagWriter(self.params.bag, compression=self.params.compression)
         self.writer.__enter__()
         self.waiting = list(dict.fromkeys(map(self.resolve_topic_name, self.params.topics)))
         self.subscription_by_topic: dict[str, Any] = {}
