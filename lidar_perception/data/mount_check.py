@@ -10,14 +10,16 @@ import numpy as np
 from lidar_perception.data.frame import Recording
 from lidar_perception.ground.params import SensorPoseParams, ThresholdParams
 from lidar_perception.ground.segment import level_points
-from lidar_perception.ground.threshold import fit_plane_by_ransac
+from lidar_perception.ground.threshold import fit_plane_by_ransac, height_above_plane
 from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
 # The floor is fitted beyond the vehicle, and near enough for one plane.
-MIN_RANGE_M, MAX_RANGE_M = 2.5, 25.0
-FLOOR_PLANE = ThresholdParams(max_slope=15.0)
+MIN_RANGE_M, MAX_RANGE_M = 2.5, 12.0
+CELL_M = 0.5                # every cell of the ground counts once, however many points it has
+FLOOR_PLANE = ThresholdParams(max_slope=10.0)
 STEEP_FLOOR_PLANE = ThresholdParams(max_slope=30.0)  # for a sensor that leans
-MIN_FLOOR_SHARE = 0.15      # minimum share of the points that must be on the plane
+MIN_CELLS = 10
+MIN_FLOOR_SHARE = 0.25      # minimum share of the cells whose lowest point must be on the plane
 FIRST_CLOUDS = 3            # number of clouds of a recording that are checked
 HEIGHT_TOLERANCE_M = 0.25   # between the parameter and the measured height
 MAX_LEAN_DEG = 5.0          # roads slope as much
@@ -25,10 +27,17 @@ MAX_LEAN_DEG = 5.0          # roads slope as much
 
 def measure_sensor_height(xyz: np.ndarray,
                           pose: SensorPoseParams = SensorPoseParams()) -> float | None:
-    """Return the height of the sensor above the plane of most of the points (N, 3) around it.
+    """Return the height of the sensor above the ground around it, in metres.
 
-    The height is in metres, and negative for a plane overhead, as of a sensor mounted upside down.
-    None if there is no such plane.
+    The ground is the plane through most of the lowest points of the cells of a grid, so that a
+    dense wall or a vehicle nearby does not outweigh it. The height is negative for a plane
+    overhead, as of a sensor mounted upside down.
+
+    Args:
+        xyz: (N, 3) points of the sensor.
+
+    Returns:
+        None if there is no such plane.
     """
     plane = _find_floor(level_points(xyz, pose))
     return None if plane is None else -float(plane[2])
@@ -92,15 +101,28 @@ def find_mount_problem(recording: Recording, clouds: Sequence[PointCloud]) -> st
 
 
 def _find_floor(xyz: np.ndarray, params: ThresholdParams = FLOOR_PLANE) -> np.ndarray | None:
-    """Return the plane z = a x + b y + c, (3,), of most of the points (N, 3) around the sensor."""
-    square = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
-    near = xyz.compress((square >= MIN_RANGE_M**2) & (square <= MAX_RANGE_M**2), axis=0)
-    plane = fit_plane_by_ransac(near, params)
+    """Return the plane z = a x + b y + c, (3,), of the ground in points (N, 3)."""
+    lowest = _find_lowest_points(xyz)
+    if len(lowest) < MIN_CELLS:
+        return None
+    plane = fit_plane_by_ransac(lowest, params)
     if plane is None:
         return None
-    x, y, z = near.T
-    on_plane = np.abs(z - (plane[0] * x + plane[1] * y + plane[2])) <= params.inlier_distance
+    on_plane = np.abs(height_above_plane(lowest, plane)) <= params.inlier_distance
     return plane if on_plane.mean() >= MIN_FLOOR_SHARE else None
+
+
+def _find_lowest_points(xyz: np.ndarray) -> np.ndarray:
+    """Return the lowest point of every cell of CELL_M around the sensor, (K, 3)."""
+    square = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
+    near = xyz.compress((square >= MIN_RANGE_M**2) & (square <= MAX_RANGE_M**2), axis=0)
+    side = 2 * round(MAX_RANGE_M / CELL_M) + 1
+    column, row = np.floor((near[:, :2] + MAX_RANGE_M) / CELL_M).astype(np.int64).T
+    cell = row * side + column
+    low = np.full(side * side, np.inf, near.dtype)
+    np.minimum.at(low, cell, near[:, 2])
+    lowest = np.flatnonzero(near[:, 2] == low[cell])
+    return near[lowest[np.unique(cell[lowest], return_index=True)[1]]]
 
 
 def _find_floors(clouds: Sequence[PointCloud],

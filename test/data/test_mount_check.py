@@ -30,6 +30,13 @@ def test_sensor_height_is_measured(height):
     assert abs(measure_sensor_height(xyz * np.float32([1, -1, -1])) + height) < 0.03
 
 
+def test_dense_vehicle_does_not_outweigh_the_ground():
+    xyz, _ = street(5, slope=(0.0, 0.03))
+    roof = np.random.default_rng(0).uniform(
+        (-3, 2.6, -0.35), (3, 4.4, -0.3), (10 * len(xyz), 3)).astype(np.float32)
+    assert abs(measure_sensor_height(np.concatenate([xyz, roof])) - 1.73) < 0.05
+
+
 @pytest.mark.parametrize("lean", [0, 3, 8, -20])
 def test_leaning_sensor_of_a_recording_is_reported(lean):
     pose = SensorPoseParams(pitch=np.radians(lean))
