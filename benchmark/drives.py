@@ -35,8 +35,8 @@ from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
 from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
 from lidar_perception.scoring.tracking.pairs import pairs_of, tracked_labels, without_ignored
-from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
-from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.camera import FORWARD_CAMERA, make_kitti_labels
+from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.tracking.params import TrackingParams
@@ -62,9 +62,9 @@ def detected(street: int, frames: int, people: float) -> Drive:
     detectors = {name: each.with_min_score(LEAST) for name, each in detectors.items()}
     drive = []
     for i in range(frames):
-        scan = scan_at(street, i, HDL64E, Scenes(None, people))
+        scan = simulate_scan(street, i, HDL64E, Scenes(None, people))
         found = {name: _found(each, scan.frame) for name, each in detectors.items()}
-        drive.append((Seen(Detections.none(), kitti_labels(scan.truth), scan.frame.stamp_ns,
+        drive.append((Seen(Detections.none(), make_kitti_labels(scan.truth), scan.frame.stamp_ns,
                            scan.pose), found))
     return drive
 

@@ -20,11 +20,11 @@ from lidar_perception.detectors.open import open_detector
 from lidar_perception.robot.deskew import deskew
 from lidar_perception.robot.poses import interpolate_poses
 from lidar_perception.runs.terminal import console
-from lidar_perception.simulation.drive import truth
-from lidar_perception.simulation.raycast import cast
-from lidar_perception.simulation.returns import returns_of
+from lidar_perception.simulation.drive import label_scan
+from lidar_perception.simulation.raycast import cast_rays
+from lidar_perception.simulation.returns import make_returns
 from lidar_perception.simulation.scene import make_scene
-from lidar_perception.simulation.sensor import HDL64E, Motion, rays
+from lidar_perception.simulation.sensor import HDL64E, Motion, make_rays
 from lidar_perception.types import CLASSES, PointCloud
 
 YAW_RATES = 0.0, 0.3, 0.6  # rad/s; at 10 m/s the last is a turn of 17 m
@@ -55,11 +55,12 @@ def turns(seed: int) -> Iterator[tuple]:
     scene = make_scene(seed)
     moment = scene.at(5.0, HDL64E.height)
     for motion in (moment.motion._replace(yaw_rate=rate) for rate in YAW_RATES):
-        hits = cast(moment.solids, scene.ground, moment.position, HDL64E, motion, seed)
-        met, reported = (returns_of(hits, HDL64E, motion, np.random.default_rng(seed), compensated)
-                         for compensated in (True, False))
+        hits = cast_rays(moment.solids, scene.ground, moment.position, HDL64E, motion, seed)
+        met, reported = (
+            make_returns(hits, HDL64E, motion, np.random.default_rng(seed), compensated)
+            for compensated in (True, False))
         corrected = deskew(reported.xyz, met.time.astype(float), partial(where, odometry(motion)))
-        since = rays(HDL64E, motion).since.astype(np.float32)
+        since = make_rays(HDL64E, motion).since.astype(np.float32)
         order = np.argsort(since)
         solid = hits.solid[order[np.searchsorted(since[order], met.time)], met.ring]
         boxes = 1 + int(moment.track_ids.max(initial=0))
@@ -67,7 +68,7 @@ def turns(seed: int) -> Iterator[tuple]:
         standing = np.zeros(boxes, bool)
         standing[moment.track_ids[moment.speeds == 0]] = True
         yield (float(np.linalg.norm(motion.velocity)), motion.yaw_rate, (met, reported, corrected),
-               thing, standing, truth(moment, hits, met.owner))
+               thing, standing, label_scan(moment, hits, met.owner))
 
 
 def errors(xyz: np.ndarray, met: np.ndarray, thing: np.ndarray) -> dict[int, float]:

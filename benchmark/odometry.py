@@ -25,7 +25,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.robot.poses import invert_pose
 from lidar_perception.runs.terminal import console, show_progress
-from lidar_perception.simulation.drive import scans
+from lidar_perception.simulation.drive import simulate_drive
 from lidar_perception.tracking.ego import Odometry
 from lidar_perception.types import PointCloud
 
@@ -55,7 +55,7 @@ def recorded(data: Path, frames: int) -> Scans:
 def simulated(streets: int, frames: int) -> Scans:
     """The first frames of so many streets."""
     for street in range(FIRST_STREET, FIRST_STREET + streets):
-        for scan in scans(street, frames):
+        for scan in simulate_drive(street, frames):
             yield str(street), scan.frame, scan.pose
 
 

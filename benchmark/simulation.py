@@ -10,8 +10,8 @@ import numpy as np
 from benchmark.rows import measured, row
 from benchmark.timing import Clock
 from lidar_perception.runs.terminal import show_progress
-from lidar_perception.simulation.raycast import cast
-from lidar_perception.simulation.returns import returns_of
+from lidar_perception.simulation.raycast import cast_rays
+from lidar_perception.simulation.returns import make_returns
 from lidar_perception.simulation.scene import Scene, make_scene
 from lidar_perception.simulation.sensor import HDL64E
 
@@ -53,9 +53,9 @@ def _busy(count: int) -> list[tuple[int, Scene]]:
 
 def _calls(seed: int, scene: Scene) -> dict:
     moment = scene.at(0.0, HDL64E.height)
-    hits = cast(moment.solids, scene.ground, moment.position, HDL64E, moment.motion)
+    hits = cast_rays(moment.solids, scene.ground, moment.position, HDL64E, moment.motion)
     return {"street": partial(make_scene, seed),
             "scene": lambda: replace(scene).at(0.0, HDL64E.height),  # with a table of its own
-            "cast": partial(cast, moment.solids, scene.ground, moment.position, HDL64E,
+            "cast": partial(cast_rays, moment.solids, scene.ground, moment.position, HDL64E,
                             moment.motion),
-            "returns": lambda: returns_of(hits, HDL64E, moment.motion, np.random.default_rng(0))}
+            "returns": lambda: make_returns(hits, HDL64E, moment.motion, np.random.default_rng(0))}

@@ -23,7 +23,7 @@ from lidar_perception.rendering.colors import BACKGROUND, color_by_cluster
 from lidar_perception.rendering.files import write_png
 from lidar_perception.rendering.picture import Boxes, Stage, draw_view, highlight_points
 from lidar_perception.rendering.views import Perspective
-from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import Detections
@@ -60,7 +60,7 @@ def draw_detect(path: Path) -> None:
 
 def make(folder: Path = FOLDER) -> None:
     """Simulate scans, run the package on them, write the pictures."""
-    frame = scan_at(SEED, 0, HDL64E, STREETS).frame
+    frame = simulate_scan(SEED, 0, HDL64E, STREETS).frame
     params = DetectorParams()
     found = open_detector("pointpillars")(frame).detections
     ground = segment_ground(frame, params.ground)

@@ -14,15 +14,15 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from lidar_perception.geometry import box_corners
-from lidar_perception.simulation.drive import scan_at
-from lidar_perception.simulation.raycast import Hits, cast
+from lidar_perception.simulation.drive import simulate_scan
+from lidar_perception.simulation.raycast import Hits, cast_rays
 from lidar_perception.simulation.scene import Scenes, make_scene
-from lidar_perception.simulation.sensor import generic, sensor_named
+from lidar_perception.simulation.sensor import find_sensor, make_generic_sensor
 
 SHOWN = (("campus", "forecourt", 2), ("indoor", "hall", 12))  # scene, kind, seed
 MOMENT, HEIGHT = 50, 0.6
 GROUND = (40, 44, 48, 72)  # of SemanticKITTI
-FINE = generic(120, -30.0, 30.0, 0.25, 10.0, height=HEIGHT, divergence=0.0)
+FINE = make_generic_sensor(120, -30.0, 30.0, 0.25, 10.0, height=HEIGHT, divergence=0.0)
 
 
 def main() -> None:
@@ -32,9 +32,9 @@ def main() -> None:
     for (scene, kind, seed), view, above in zip(SHOWN, axes[::2], axes[1::2]):
         made = make_scene(seed, kind, 1.0, scene)
         moment = made.at(MOMENT / FINE.rate, HEIGHT)
-        draw_view(view, cast(moment.solids, made.ground, moment.position, FINE, moment.motion,
-                             heading=moment.heading))
-        scan = scan_at(seed, MOMENT, sensor_named("vlp-16", HEIGHT), Scenes(kind, 1.0, scene))
+        draw_view(view, cast_rays(moment.solids, made.ground, moment.position, FINE, moment.motion,
+                                  heading=moment.heading))
+        scan = simulate_scan(seed, MOMENT, find_sensor("vlp-16", HEIGHT), Scenes(kind, 1.0, scene))
         ground = np.isin(scan.semantic, GROUND)
         for mask, size, colour in ((ground, 0.3, "0.7"), (~ground, 0.8, "tab:brown")):
             above.scatter(*scan.frame.xyz[mask, :2].T, s=size, c=colour, linewidths=0)

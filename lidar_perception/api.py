@@ -29,9 +29,9 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.detections import by_detector
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.scoring.run import Skipped, results
+from lidar_perception.simulation.recording import simulate_recording
 from lidar_perception.simulation.scene import Scenes
-from lidar_perception.simulation.sensor import sensor_named
-from lidar_perception.simulation.to_bag import simulated_recording
+from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.types import (
     SENSOR_HEIGHT,
     Detections,
@@ -229,8 +229,8 @@ def simulate(frames: int = 40, seed: int = 1, sensor: str = "hdl64e", scene: str
     if frames < 1 or seed < 0:
         name, value, low = ("frames", frames, 1) if frames < 1 else ("seed", seed, 0)
         raise InputError(f"{name} = {value} must be {low} or more")
-    return simulated_recording(seed, frames, sensor_named(sensor, sensor_height or 0.0),
-                               scenes=Scenes(kind, people, scene))
+    return simulate_recording(seed, frames, find_sensor(sensor, sensor_height or 0.0),
+                              scenes=Scenes(kind, people, scene))
 
 
 def _make_cloud(xyz: PointCloud | ArrayLike, intensity: ArrayLike | None) -> PointCloud:

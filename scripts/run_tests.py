@@ -35,12 +35,12 @@ COMPILE = ("""
 from lidar_perception.candidates.warm_up import warm_up
 warm_up()
 """, """
-from lidar_perception.simulation.to_bag import simulated_scans
-next(iter(simulated_scans(1, 1))).load()
+from lidar_perception.simulation.recording import simulate_frames
+next(iter(simulate_frames(1, 1))).load()
 """, """
 from lidar_perception.detectors.open import LOAD, open_detector
-from lidar_perception.simulation.to_bag import simulated_scans
-for frame in simulated_scans(1, 1):
+from lidar_perception.simulation.recording import simulate_frames
+for frame in simulate_frames(1, 1):
     for name in LOAD:
         open_detector(name)(frame.load())
 """)

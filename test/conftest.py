@@ -110,7 +110,7 @@ def streets():
 
     from lidar_perception.simulation import drive
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(drive, "_scene", cache(drive._scene.__wrapped__))
+        patch.setattr(drive, "_make_cached_scene", cache(drive._make_cached_scene.__wrapped__))
         yield
 
 

@@ -14,9 +14,9 @@ from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import data_argument, opened, out_file, write_json
 from lidar_perception.data.frame import BOXES
 from lidar_perception.runs.terminal import console, show_progress
-from lidar_perception.simulation.scene import MOST_PEOPLE, Scenes
-from lidar_perception.simulation.sensor import sensor_named
-from lidar_perception.simulation.to_bag import simulated_scans
+from lidar_perception.simulation.recording import simulate_frames
+from lidar_perception.simulation.scene import MAX_PEOPLE, Scenes
+from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.types import InputError
 
 
@@ -29,7 +29,7 @@ from lidar_perception.types import InputError
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
               help="Number of simulated scans, each of another street.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
-@click.option("--people", type=click.FloatRange(0, MOST_PEOPLE), default=1.0, show_default=True,
+@click.option("--people", type=click.FloatRange(0, MAX_PEOPLE), default=1.0, show_default=True,
               help="Pedestrians and cyclists, as a multiple of the usual.")
 @out_file("--json", "Write every curve to this file.")
 @out_file("--png", "Draw every curve into this file.")
@@ -41,13 +41,13 @@ def main(data: Path, sensor: str, mount_height: float, frames: int, seed: int, p
     Example:
       python -m experiments.realism /data/kitti/object --png realism.png
     """
-    model = sensor_named(sensor, mount_height)
+    model = find_sensor(sensor, mount_height)
     recording = opened(data)
     recording.require(BOXES, "realism")
     chosen = evenly(recording)
     warm_up()
     measured = measured_scans(show_progress(chosen, "measuring real scans", len(chosen)), PAPER)
-    made = simulated_scans(seed, frames, model, streets_of=1, scenes=Scenes(None, people, "street"))
+    made = simulate_frames(seed, frames, model, streets_of=1, scenes=Scenes(None, people, "street"))
     simulated = measured_scans(show_progress(made, "measuring simulated scans", frames), PAPER)
     content = {"data": str(data), "seed": seed, **side_by_side(measured, simulated)}
     print_realism(content, console)

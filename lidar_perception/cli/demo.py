@@ -190,9 +190,9 @@ def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
     if recording is not None:
         found = show_progress(recording, f"converting {recording.path}", len(recording))
     else:
-        from lidar_perception.simulation.scene import CROWDED
-        from lidar_perception.simulation.to_bag import simulated_scans
-        found = show_progress(simulated_scans(drive_seed, frames, scenes=CROWDED),
+        from lidar_perception.simulation.recording import simulate_frames
+        from lidar_perception.simulation.scene import CROWDED_ZONES
+        found = show_progress(simulate_frames(drive_seed, frames, scenes=CROWDED_ZONES),
                               "simulating a drive",
                               frames)
     write_bag(path, found, force=True)

@@ -18,11 +18,11 @@ from lidar_perception.runs.machine import count_cores
 from lidar_perception.runs.resumable_folder import is_finished, make_resumable_folder
 from lidar_perception.runs.resuming import hash_names
 from lidar_perception.runs.terminal import console, show_progress
-from lidar_perception.simulation.dataset import FOLDERS, LAYOUTS, Plan, write_frames
+from lidar_perception.simulation.dataset import FOLDERS, LAYOUTS, DatasetPlan, write_frames
 from lidar_perception.simulation.drive import longest_drive
-from lidar_perception.simulation.scene import MOST_PEOPLE, SCENES, Scenes
-from lidar_perception.simulation.sensor import GENERIC, NAMES, sensor_named
-from lidar_perception.simulation.to_bag import simulated_scans
+from lidar_perception.simulation.recording import simulate_frames
+from lidar_perception.simulation.scene import MAX_PEOPLE, SCENE_TYPES, Scenes
+from lidar_perception.simulation.sensor import GENERIC_FORMAT, SENSOR_NAMES, find_sensor
 from lidar_perception.types import InputError
 
 
@@ -32,8 +32,8 @@ from lidar_perception.types import InputError
               default="mcap", show_default=True, help="A rosbag2 bag, or the folders of one of "
               "these data sets.")
 @click.option("--sensor", "sensor_name", default="hdl64e", show_default=True,
-              help=f"One of {', '.join(NAMES)}, in any spelling (hdl64e is hdl-64e), a .yaml "
-              f"file (`setup` writes one), or {GENERIC}.")
+              help=f"One of {', '.join(SENSOR_NAMES)}, in any spelling (hdl64e is hdl-64e), a "
+              f".yaml file (`setup` writes one), or {GENERIC_FORMAT}.")
 @click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
               help="Height of the sensor above the ground. Default: what its file or preset says.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
@@ -41,11 +41,11 @@ from lidar_perception.types import InputError
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True,
               help="Seed of the first street; the same seed gives the same bytes.")
 @click.option("--scene", default="street", show_default=True, metavar="NAME",
-              help=f"One of {', '.join(SCENES)}, or several in turn, such as street,campus.")
+              help=f"One of {', '.join(SCENE_TYPES)}, or several in turn, such as street,campus.")
 @click.option("--kind", "--street", "kind", metavar="KIND", help="Scenes of this kind only: "
-              + "; ".join(f"{name} {', '.join(one.kinds)}" for name, one in SCENES.items())
+              + "; ".join(f"{name} {', '.join(one.kinds)}" for name, one in SCENE_TYPES.items())
               + ". Default: all.")
-@click.option("--people", type=click.FloatRange(0, MOST_PEOPLE), default=1.0,
+@click.option("--people", type=click.FloatRange(0, MAX_PEOPLE), default=1.0,
               show_default=True, help="Pedestrians and cyclists, as a multiple of the usual; on "
               "streets of KITTI's.")
 @click.option("--streets-of", type=click.IntRange(1), metavar="N",
@@ -72,9 +72,9 @@ def simulate(out: Path, layout: str, sensor_name: str, frames: int, seed: int,
     scenes = Scenes(kind, people, scene)
     if resume and force:
         raise click.UsageError("--resume resumes, --force starts over: give one of them")
-    sensor = sensor_named(sensor_name, mount_height)
-    plan = Plan(layout, sensor, seed, frames,
-                streets_of or (1 if layout == "kitti" else longest_drive(sensor)), scenes)
+    sensor = find_sensor(sensor_name, mount_height)
+    plan = DatasetPlan(layout, sensor, seed, frames,
+                       streets_of or (1 if layout == "kitti" else longest_drive(sensor)), scenes)
     if layout == "mcap":
         if resume:
             raise click.UsageError("a bag is one file and cannot be resumed; make kitti-tracking, "
@@ -84,13 +84,13 @@ def simulate(out: Path, layout: str, sensor_name: str, frames: int, seed: int,
         _data_set(out, plan, sensor_name, mount_height, jobs or count_cores(), resume, force)
 
 
-def _bag(out: Path, plan: Plan, force: bool) -> None:
-    scans = simulated_scans(plan.seed, plan.frames, plan.sensor, plan.streets_of, plan.scenes)
+def _bag(out: Path, plan: DatasetPlan, force: bool) -> None:
+    scans = simulate_frames(plan.seed, plan.frames, plan.sensor, plan.streets_of, plan.scenes)
     count = write_bag(out, show_progress(scans, "simulating", plan.frames), force=force)
     console.print(f"{out}: {count} scans")
 
 
-def _data_set(out: Path, plan: Plan, sensor_name: str, mount_height: float, jobs: int,
+def _data_set(out: Path, plan: DatasetPlan, sensor_name: str, mount_height: float, jobs: int,
               resume: bool, force: bool) -> None:
     scenes = plan.scenes
     asked = {"format": plan.layout, "sensor": sensor_name, "height": plan.sensor.height,

@@ -10,19 +10,19 @@ from math import cos, sin
 import numpy as np
 from numba import njit
 
-from lidar_perception.simulation.shapes.thing import Thing, rigid
-from lidar_perception.simulation.solids import hull
-from lidar_perception.simulation.way import Way
+from lidar_perception.simulation.shapes.thing import Thing, make_rigid
+from lidar_perception.simulation.solids import compute_hull
+from lidar_perception.simulation.trajectory import Trajectory
 
-HEAD_ROOM = 2.2  # metres; what hangs higher is in nobody's way
-SIGHT, FAR_SIGHT = 80.0, 120.0  # metres from the sensor; what is farther is left out of a moment;
-LARGE = 5.0                     # FAR_SIGHT is for what is so large, m
-STEP = 0.1                      # s between the places of a robot that others keep clear of
+HEAD_ROOM_M = 2.2  # parts that hang higher block nobody
+SIGHT_M, FAR_SIGHT_M = 80.0, 120.0  # farther things are left out of a moment; the latter for
+LARGE_M = 5.0                       # things of this size
+STEP_S = 0.1  # between the positions of a robot that others keep clear of
 
 
-def prop(made: np.ndarray) -> Thing:
+def make_prop(made: np.ndarray) -> Thing:
     """A thing without a label, of parts (P,) PART."""
-    return rigid(made, (0.0, 0.0, 0.0), "")
+    return make_rigid(made, (0.0, 0.0, 0.0), "")
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Actor:
     @cached_property
     def footprint(self) -> np.ndarray:
         """(8,) float64, see below; holds the box of a walker, which covers all poses."""
-        x0, y0, _, x1, y1, _ = hull(self.thing.parts(0.0), HEAD_ROOM)
+        x0, y0, _, x1, y1, _ = compute_hull(self.thing.parts(0.0), HEAD_ROOM_M)
         length, width, _ = self.thing.size
         x0, x1 = min(x0, -length / 2), max(x1, length / 2)
         y0, y1 = min(y0, -width / 2), max(y1, width / 2)
@@ -57,7 +57,7 @@ class Actor:
 X, Y, HEADING, LENGTH, WIDTH, SPEED, START, STOP = range(8)
 
 
-def centres(footprints: np.ndarray, t: np.ndarray) -> np.ndarray:
+def compute_centres(footprints: np.ndarray, t: np.ndarray) -> np.ndarray:
     """(M, T, 2) centres of footprints (M, 8) at times t (M, T) or (T,)."""
     f = footprints[:, None]
     way = f[..., SPEED] * np.clip(t - f[..., START], 0.0, f[..., STOP] - f[..., START])
@@ -66,24 +66,25 @@ def centres(footprints: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def _meet_any(one, many, reach, seconds, gap):
+def _touches_any(one, many, reach, seconds, gap):
     """Whether one meets any of many; reach (M,): of these, see _reach."""
-    far = _reach(one, seconds) + gap
+    far = _max_reach(one, seconds) + gap
     for m in range(len(many)):
         x, y, near = many[m, X] - one[X], many[m, Y] - one[Y], far + reach[m]
-        if 0 <= near and x * x + y * y <= near * near and meet(one, many[m], seconds, gap):
+        if 0 <= near and x * x + y * y <= near * near and footprints_touch(
+                one, many[m], seconds, gap):
             return True
     return False
 
 
 @njit(cache=True, nogil=True)
-def _reach(one, seconds):
+def _max_reach(one, seconds):
     """How far from its first place any of a footprint ever gets."""
     return math.hypot(one[LENGTH], one[WIDTH]) + one[SPEED] * seconds
 
 
 @njit(cache=True, nogil=True)
-def meet(one, other, seconds, gap):
+def footprints_touch(one, other, seconds, gap):
     """Whether two footprints (8,) come within gap metres of each other at any time in 0 .. seconds.
     Exact for gap 0: convex shapes that slide along straight lines touch while their shadows on the
     normals of all sides do."""
@@ -93,8 +94,8 @@ def meet(one, other, seconds, gap):
         times[i] = min(max(times[i], 0.0), seconds)
     times.sort()
     for i in range(5):  # straight in between
-        x, y = _apart(one, other, times[i])
-        next_x, next_y = _apart(one, other, times[i + 1])
+        x, y = _compute_offset(one, other, times[i])
+        next_x, next_y = _compute_offset(one, other, times[i + 1])
         enter, leave = 0.0, 1.0  # shares of this piece
         for side in range(4):
             angle = (one if side < 2 else other)[HEADING] + side % 2 * np.pi / 2
@@ -117,7 +118,7 @@ def meet(one, other, seconds, gap):
 
 
 @njit(cache=True, nogil=True)
-def _apart(one, other, t):
+def _compute_offset(one, other, t):
     """From the centre of one to that of the other at time t."""
     way = one[SPEED] * min(max(t - one[START], 0.0), one[STOP] - one[START])
     other_way = other[SPEED] * min(max(t - other[START], 0.0), other[STOP] - other[START])
@@ -128,7 +129,7 @@ def _apart(one, other, t):
 
 
 @njit(cache=True, nogil=True)
-def _meets_way(one, way, radius):
+def _touches_trajectory(one, way, radius):
     """Whether a footprint (8,) comes within radius of a way (T, 3), [t x y]; as both move between
     the times of the way, half of what they cover in a step is added."""
     cos, sin = math.cos(one[HEADING]), math.sin(one[HEADING])
@@ -148,11 +149,11 @@ class Room:
     """The actors of a scene so far; a newcomer must keep clear of all of them all the time."""
 
     def __init__(self, seconds: float, keep_clear: np.ndarray | None = None,
-                 way: Way | None = None, radius: float = 0.0):
+                 way: Trajectory | None = None, radius: float = 0.0):
         """keep_clear (M, 8): footprints that are taken from the start; way: of a round robot of
         that radius, m."""
         self.seconds = seconds
-        self._way = np.empty((0, 3)) if way is None else way.sampled(seconds, STEP)
+        self._way = np.empty((0, 3)) if way is None else way.sampled(seconds, STEP_S)
         self._radius = radius
         self.actors: list[Actor] = []
         self._taken, self._reach, self._used = np.empty((64, 8)), np.empty(64), 0
@@ -165,9 +166,9 @@ class Room:
         before = self._used
         for actor in group:
             row, own = actor.footprint, slice(before, self._used)
-            if (_meets_way(row, self._way, self._radius + gap)
-                    or _meet_any(row, self._taken[:before], self._reach, self.seconds, gap)
-                    or _meet_any(row, self._taken[own], self._reach[own], self.seconds, 0.0)):
+            if (_touches_trajectory(row, self._way, self._radius + gap)
+                    or _touches_any(row, self._taken[:before], self._reach, self.seconds, gap)
+                    or _touches_any(row, self._taken[own], self._reach[own], self.seconds, 0.0)):
                 self._used = before
                 return False
             self._take(row)
@@ -183,5 +184,5 @@ class Room:
     def _take(self, row: np.ndarray) -> None:
         if self._used == len(self._taken):  # room for twice as many
             self._taken, self._reach = np.tile(self._taken, (2, 1)), np.tile(self._reach, 2)
-        self._taken[self._used], self._reach[self._used] = row, _reach(row, self.seconds)
+        self._taken[self._used], self._reach[self._used] = row, _max_reach(row, self.seconds)
         self._used += 1

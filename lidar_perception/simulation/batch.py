@@ -8,13 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from lidar_perception.simulation.drive import scan_at
-from lidar_perception.simulation.scene import ANY, Scenes
+from lidar_perception.simulation.drive import simulate_scan
+from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 
 
-def training_scans(seed: int = 0, sensor: Sensor = HDL64E,
-                   scenes: Scenes = ANY) -> Iterator[dict[str, torch.Tensor]]:
+def generate_training_scans(seed: int = 0, sensor: Sensor = HDL64E,
+                            scenes: Scenes = ALL_STREETS) -> Iterator[dict[str, torch.Tensor]]:
     """Without end: the first scan of the scenes seed, seed + 1, ..., with all their labels.
 
     points (N, 4) float32 [x y z intensity], boxes (K, 7) float32 and class_ids (K,) int64 as in
@@ -24,7 +24,7 @@ def training_scans(seed: int = 0, sensor: Sensor = HDL64E,
     worker = torch.utils.data.get_worker_info()
     first, step = (worker.id, worker.num_workers) if worker else (0, 1)
     for number in itertools.count(seed + first, step):
-        scan = scan_at(number, 0, sensor, scenes)
+        scan = simulate_scan(number, 0, sensor, scenes)
         arrays = {
             "points": scan.frame.points(),
             "boxes": scan.truth.boxes.astype(np.float32),

@@ -7,39 +7,40 @@ from collections.abc import Iterator
 import numpy as np
 
 from lidar_perception.simulation.actors import Actor, Room
-from lidar_perception.simulation.places import Court, Side, scattered
+from lidar_perception.simulation.places import Court, Side, scatter
 from lidar_perception.simulation.shapes import furniture
-from lidar_perception.simulation.shapes.people import CARRIED, pedestrian, sitting
+from lidar_perception.simulation.shapes.people import CARRIED, make_pedestrian, make_sitting_person
 from lidar_perception.simulation.shapes.thing import Thing
-from lidar_perception.simulation.shapes.wheelchairs import wheelchair
+from lidar_perception.simulation.shapes.wheelchairs import make_wheelchair
 
-STANDING, WALKING = (0.55, 0.3, 0.1, 0.05), (0.62, 0.3, 0.08)  # chances of groups of 1, 2, ..
-HOURS = 0.3, 1.0, 1.0, 2.5  # how busy a place is
-WHEELCHAIRS = 0.06  # for each group that walks or stands
+# Chances of groups of 1, 2, ... people.
+STANDING_CHANCES, WALKING_CHANCES = (0.55, 0.3, 0.1, 0.05), (0.62, 0.3, 0.08)
+BUSYNESS = 0.3, 1.0, 1.0, 2.5  # how busy a place is
+WHEELCHAIR_SHARE = 0.06  # for each group that walks or stands
 
 
-def person(rng, speed: float = 0.0) -> Thing:
+def make_person(rng, speed: float = 0.0) -> Thing:
     """Someone who walks at that speed, m/s, or stands; some are children, some carry something."""
     carried = rng.choice(CARRIED, p=(0.6, 0.14, 0.14, 0.04, 0.04, 0.04))
-    return pedestrian(rng, speed, child=rng.random() < 0.08, carried=str(carried))
+    return make_pedestrian(rng, speed, child=rng.random() < 0.08, carried=str(carried))
 
 
-def standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
+def place_standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
     """People who wait, and some who talk and face one another."""
-    for along in scattered(rng, side.length, rate):
+    for along in scatter(rng, side.length, rate):
         out, many = rng.uniform(0.4, max(side.walk - 0.4, 1.0)), rng.choice([1, 2, 3, 4],
-                                                                            p=STANDING)
+                                                                            p=STANDING_CHANCES)
         first, wide = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 0.7) * (many > 1)
         angles = first + 2 * np.pi / many * np.arange(many)
-        yield [side.put(person(rng), along + wide * np.cos(a), out + wide * np.sin(a),
+        yield [side.put(make_person(rng), along + wide * np.cos(a), out + wide * np.sin(a),
                         a + np.pi + rng.normal(0, 0.15)) for a in angles]
 
 
-def walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Actor]]:
+def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Actor]]:
     """People on their way along a sidewalk, alone, in pairs or more; where they may roam, on the
     road and in any direction, too. Some start or stop on the way."""
-    for along in scattered(rng, side.length, rate):
-        speed = _pace(rng)
+    for along in scatter(rng, side.length, rate):
+        speed = _draw_speed(rng)
         turn = np.pi * rng.integers(2) + rng.normal(0, 0.02)
         low = 0.9
         if roam:
@@ -49,52 +50,53 @@ def walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Actor]]:
         pick = rng.random()
         if pick < 0.2:
             moves["start" if pick < 0.1 else "stop"] = rng.uniform(1, 15)
-        many = rng.choice([1, 2, 3], p=WALKING)
-        yield [side.put(person(rng, speed), along + rng.uniform(-0.2, 0.2),
+        many = rng.choice([1, 2, 3], p=WALKING_CHANCES)
+        yield [side.put(make_person(rng, speed), along + rng.uniform(-0.2, 0.2),
                         out + 0.85 * i, turn, **moves) for i in range(many)]
 
 
-def strolling(rng, court: Court, rate: float) -> Iterator[list[Actor]]:
+def place_strolling(rng, court: Court, rate: float) -> Iterator[list[Actor]]:
     """People on their way across a place in any direction, rate groups on 100 square metres; half
     of them start or stop on the way."""
     for x, y in court.spots(rng, rate):
-        speed, turn = _pace(rng), rng.uniform(-np.pi, np.pi)
+        speed, turn = _draw_speed(rng), rng.uniform(-np.pi, np.pi)
         moves = {"speed": speed}
         if (pick := rng.random()) < 0.5:
             moves["start" if pick < 0.25 else "stop"] = rng.uniform(1, 15)
-        many = rng.choice([1, 2, 3], p=WALKING)
-        yield [Actor(person(rng, speed), x - 0.85 * i * np.sin(turn), y + 0.85 * i * np.cos(turn),
-                     turn, **moves) for i in range(many)]
+        many = rng.choice([1, 2, 3], p=WALKING_CHANCES)
+        yield [Actor(make_person(rng, speed), x - 0.85 * i * np.sin(turn),
+                     y + 0.85 * i * np.cos(turn), turn, **moves) for i in range(many)]
 
 
-def _pace(rng) -> float:
+def _draw_speed(rng) -> float:
     """m/s; some run."""
     return float(np.clip(rng.normal(1.35, 0.25), 0.6, 2.0) if rng.random() < 0.97 else 2.7)
 
 
-def fill(rng, room: Room, court: Court, people: float, along: float, across: float,
-         standers: float) -> None:
+def fill_court(rng, room: Room, court: Court, people: float, along: float, across: float,
+               standers: float) -> None:
     """Who is on foot in a court: groups who walk along x and groups who stand on each 100 m of it,
     groups who walk anywhere on each 100 square metres, each times people and by the hour."""
-    people *= rng.choice(HOURS)
-    for groups in (standing(rng, court.floor, standers * people),
-                   walking(rng, court.floor, along * people, roam=False),
-                   wheeling(rng, court.floor, WHEELCHAIRS * (along + standers) * people),
-                   strolling(rng, court.inner(0.4), across * people)):
+    people *= rng.choice(BUSYNESS)
+    for groups in (place_standing(rng, court.floor, standers * people),
+                   place_walking(rng, court.floor, along * people, roam=False),
+                   place_wheelchairs(rng, court.floor,
+                                     WHEELCHAIR_SHARE * (along + standers) * people),
+                   place_strolling(rng, court.inner(0.4), across * people)):
         for group in groups:
             room.admit(*group)
 
 
-def wheeling(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
+def place_wheelchairs(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
     """People in wheelchairs, along a side."""
-    for along in scattered(rng, side.length, rate):
-        yield [side.put(wheelchair(rng), along, rng.uniform(0.5, max(side.walk - 0.5, 0.6)),
+    for along in scatter(rng, side.length, rate):
+        yield [side.put(make_wheelchair(rng), along, rng.uniform(0.5, max(side.walk - 0.5, 0.6)),
                         np.pi * rng.integers(2) + rng.normal(0, 0.1),
                         speed=rng.choice((0.0, rng.uniform(0.5, 1.3))))]
 
 
-def bench(rng, side: Side, along: float, out: float, people: float) -> list[Actor]:
+def place_bench(rng, side: Side, along: float, out: float, people: float) -> list[Actor]:
     """A bench whose back is towards the outside of a side, and who sits there."""
-    sitters = [side.put(sitting(rng, chair=False), along + aside, out, -np.pi / 2)
+    sitters = [side.put(make_sitting_person(rng, chair=False), along + aside, out, -np.pi / 2)
                for aside in (-0.45, 0.45) if rng.random() < min(0.25 * people, 0.8)]
-    return [side.put(furniture.bench(rng), along, out, -np.pi / 2), *sitters]
+    return [side.put(furniture.make_bench(rng), along, out, -np.pi / 2), *sitters]

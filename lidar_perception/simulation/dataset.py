@@ -17,9 +17,9 @@ from lidar_perception.data import semantickitti
 from lidar_perception.data.kitti import write as write_kitti
 from lidar_perception.runs.processes import run_in_processes
 from lidar_perception.runs.resumable_folder import finish_frame
-from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
-from lidar_perception.simulation.drive import SimulatedScan, longest_drive, scan_at
-from lidar_perception.simulation.scene import ANY, Scenes
+from lidar_perception.simulation.camera import FORWARD_CAMERA, make_kitti_labels
+from lidar_perception.simulation.drive import SimulatedScan, longest_drive, simulate_scan
+from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import Sensor
 from lidar_perception.types import InputError
 
@@ -28,7 +28,7 @@ FOLDERS = ("training", "sequences")  # that one of them has in it
 
 
 @dataclass(frozen=True)
-class Plan:
+class DatasetPlan:
     """frames scans, streets_of of each of the scenes seed, seed + 1, ..., in one of LAYOUTS.
     InputError for numbers that cannot be."""
 
@@ -37,7 +37,7 @@ class Plan:
     seed: int
     frames: int
     streets_of: int
-    scenes: Scenes = ANY
+    scenes: Scenes = ALL_STREETS
 
     def __post_init__(self) -> None:
         most = longest_drive(self.sensor)
@@ -54,17 +54,17 @@ class Plan:
                 raise InputError(what)
 
 
-def write_frame(folder: Path, plan: Plan, number: int) -> None:
+def write_frame(folder: Path, plan: DatasetPlan, number: int) -> None:
     """Simulate and write frame number, all of its files. InputError where one cannot be
     written."""
     sequence, moment = divmod(number, plan.streets_of)
-    scan = scan_at(plan.seed + sequence, moment, plan.sensor, plan.scenes)
+    scan = simulate_scan(plan.seed + sequence, moment, plan.sensor, plan.scenes)
     order = np.argsort(scan.ring, kind="stable")  # as in KITTI's files, beam after beam
     cloud = scan.frame.points()[order]
     if plan.layout == "semantickitti":
-        shares = _semantic(folder, plan, sequence, moment, scan, cloud, order)
+        shares = _write_semantickitti(folder, plan, sequence, moment, scan, cloud, order)
     else:
-        truth = kitti_labels(scan.truth)
+        truth = make_kitti_labels(scan.truth)
         if plan.layout == "kitti":
             write_kitti.write_object(folder, number, cloud, truth, FORWARD_CAMERA)
             shares = {}
@@ -79,8 +79,9 @@ def write_frame(folder: Path, plan: Plan, number: int) -> None:
     finish_frame(folder, number, shares)
 
 
-def _semantic(folder: Path, plan: Plan, sequence: int, moment: int, scan: SimulatedScan,
-              cloud: np.ndarray, order: np.ndarray) -> dict[str, str]:
+def _write_semantickitti(folder: Path, plan: DatasetPlan, sequence: int, moment: int,
+                         scan: SimulatedScan, cloud: np.ndarray,
+                         order: np.ndarray) -> dict[str, str]:
     digits = max(2, len(str((plan.frames - 1) // plan.streets_of)))
     name = f"sequences/{sequence:0{digits}}"
     semantickitti.write_scan(folder / name, moment, cloud, scan.semantic[order],
@@ -92,13 +93,14 @@ def _semantic(folder: Path, plan: Plan, sequence: int, moment: int, scan: Simula
     return shares
 
 
-def write_frames(folder: Path, plan: Plan, numbers: list[int], jobs: int) -> Generator[int]:
+def write_frames(folder: Path, plan: DatasetPlan, numbers: list[int], jobs: int) -> Generator[int]:
     """Write the frames of these numbers with so many processes; yields each when it is there.
     InputError, and the end of all processes, where one fails; they end with the iterator too."""
-    return run_in_processes(functools.partial(_writer, folder, plan), numbers, jobs, "wrote frames")
+    return run_in_processes(functools.partial(_make_writer, folder, plan), numbers, jobs,
+                            "wrote frames")
 
 
-def _writer(folder: Path, plan: Plan) -> Callable[[int], int]:
+def _make_writer(folder: Path, plan: DatasetPlan) -> Callable[[int], int]:
     def write(number: int) -> int:
         write_frame(folder, plan, number)
         return number

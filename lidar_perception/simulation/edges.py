@@ -15,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from lidar_perception.simulation.hashing import uniform
+from lidar_perception.simulation.hashing import hash_uniform
 
 OUTLIER = 1  # SemanticKITTI's class of returns that are from no surface
 
 
-class Met(NamedTuple):
+class RayHit(NamedTuple):
     """What a ray meets: range m, inf where nothing; brightness and cosine of the incidence; owner,
     0 where no object; semantic class, 0 where nothing; solid, -1 where none."""
 
@@ -32,7 +32,7 @@ class Met(NamedTuple):
     solid: int
 
 
-def at_edges(solid: np.ndarray) -> np.ndarray:
+def find_edges(solid: np.ndarray) -> np.ndarray:
     """(columns, rings) bool: a neighbour has another solid."""
     edge = np.zeros(solid.shape, bool)
     other = solid != np.roll(solid, 1, axis=0)
@@ -44,11 +44,11 @@ def at_edges(solid: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def footprint(way, divergence, key):
+def draw_in_footprint(way, divergence, key):
     """Direction to a random place, uniform in the disc of the beam along way (x, y, z)."""
     x, y, z = way
-    radius = divergence / 2 * math.sqrt(uniform(3, key))
-    turn = 2 * np.pi * uniform(4, key)
+    radius = divergence / 2 * math.sqrt(hash_uniform(3, key))
+    turn = 2 * np.pi * hash_uniform(4, key)
     aside, up, level = radius * math.cos(turn), radius * math.sin(turn), math.hypot(x, y)
     a = x - aside * y / level - up * z * x / level
     b = y + aside * x / level - up * z * y / level
@@ -58,19 +58,19 @@ def footprint(way, divergence, key):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def merged(one, other, pulse, key):
+def merge_hits(one, other, pulse, key):
     """The Met of a beam whose two rays meet one and other."""
     if one.solid == other.solid:
         return one
-    share = uniform(5, key)  # of other
+    share = hash_uniform(5, key)  # of other
     first, second = one.brightness * (1 - share), other.brightness * share
     if one.range < np.inf and other.range < np.inf and abs(one.range - other.range) < pulse:
-        return Met(one.range * (1 - share) + other.range * share, first + second,
-                   one.cosine * (1 - share) + other.cosine * share,
-                   one.owner if one.owner == other.owner else 0,
-                   one.semantic if one.semantic == other.semantic else OUTLIER,
-                   other.solid if share > 0.5 else one.solid)
+        return RayHit(one.range * (1 - share) + other.range * share, first + second,
+                      one.cosine * (1 - share) + other.cosine * share,
+                      one.owner if one.owner == other.owner else 0,
+                      one.semantic if one.semantic == other.semantic else OUTLIER,
+                      other.solid if share > 0.5 else one.solid)
     # An empty ray has no power: 0 / inf.
     if second / other.range ** 2 > first / one.range ** 2:
-        return Met(other.range, second, other.cosine, other.owner, other.semantic, other.solid)
-    return Met(one.range, first, one.cosine, one.owner, one.semantic, one.solid)
+        return RayHit(other.range, second, other.cosine, other.owner, other.semantic, other.solid)
+    return RayHit(one.range, first, one.cosine, one.owner, one.semantic, one.solid)

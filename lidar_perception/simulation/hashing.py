@@ -10,15 +10,15 @@ GOLDEN, FIRST, SECOND = (np.uint64(n) for n in (
 
 
 @njit(cache=True, nogil=True)
-def uniform(seed, key):
+def hash_uniform(seed, key):
     """float64 in the open interval 0 .. 1 for a uint64 key and a small seed; the same in any order.
     The finalizer is splitmix64's (Steele, Lea and Flood, OOPSLA 2014)."""
-    bits = mixed(mixed(key) + np.uint64(seed) * GOLDEN) >> np.uint64(12)
+    bits = mix_bits(mix_bits(key) + np.uint64(seed) * GOLDEN) >> np.uint64(12)
     return (np.float64(bits) + 0.5) * 2.0 ** -52
 
 
 @njit(cache=True, nogil=True)
-def mixed(x):
+def mix_bits(x):
     """uint64 to uint64, one to one."""
     x = (x ^ (x >> np.uint64(30))) * FIRST
     x = (x ^ (x >> np.uint64(27))) * SECOND

@@ -8,20 +8,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidar_perception.simulation import crowd
-from lidar_perception.simulation.actors import Actor, Room, prop
-from lidar_perception.simulation.places import Court, Side, against, evenly_spaced
+from lidar_perception.simulation.actors import Actor, Room, make_prop
+from lidar_perception.simulation.places import Court, Side, place_against, space_evenly
 from lidar_perception.simulation.roadside import FRONTS
 from lidar_perception.simulation.shapes import furniture, interiors
-from lidar_perception.simulation.shapes.people import sitting
+from lidar_perception.simulation.shapes.people import make_sitting_person
 from lidar_perception.simulation.terrain import PAVEMENT, Ground
-from lidar_perception.simulation.way import ROBOT, SECONDS, Way, swaying
+from lidar_perception.simulation.trajectory import (
+    DRIVE_SECONDS,
+    ROBOT_RADIUS_M,
+    Trajectory,
+    draw_trajectory,
+)
 
-OUTSIDE = 4.0  # m from windows to the plants before them
-SEAT = 0.65    # m of a table for each who sits at it
+WINDOW_VIEW_M = 4.0  # m from windows to the plants before them
+SEAT_WIDTH_M = 0.65    # m of a table for each who sits at it
 
 
 @dataclass(frozen=True)
-class Kind:
+class IndoorKind:
     """Ranges (low, high) are drawn from uniformly; lengths in metres; shares and chances are in
     0 .. 1. What comes first is laid out around the way of the robot."""
 
@@ -42,55 +47,57 @@ class Kind:
     speed: tuple[float, float] = (0.5, 1.5)
 
 
-KINDS = {
-    "corridor": Kind(0.35, (0.7, 1.7), (8.0, 35.0), (2.4, 3.2), {
+INDOOR_KINDS = {
+    "corridor": IndoorKind(0.35, (0.7, 1.7), (8.0, 35.0), (2.4, 3.2), {
         "wall": 0.42, "door": 0.38, "glazing": 0.1, "passage": 0.1}, (), 0.25, along=45.0,
         standers=8.0, things=0.6, at_walls=22.0),
-    "hall": Kind(0.3, (5.0, 14.0), (6.0, 20.0), (3.5, 8.0), {
+    "hall": IndoorKind(0.3, (5.0, 14.0), (6.0, 20.0), (3.5, 8.0), {
         "wall": 0.4, "door": 0.2, "glazing": 0.2, "passage": 0.2}, ("columns", "benches", "tables"),
         0.7, outer=0.4, across=2.2, standers=16.0),
-    "canteen": Kind(0.2, (3.0, 9.0), (6.0, 14.0), (2.7, 4.5), {
+    "canteen": IndoorKind(0.2, (3.0, 9.0), (6.0, 14.0), (2.7, 4.5), {
         "wall": 0.6, "door": 0.15, "glazing": 0.15, "passage": 0.1}, ("columns", "many tables"),
         0.3, outer=0.35, across=2.0, standers=14.0, along=12.0),
-    "store": Kind(0.15, (4.0, 10.0), (6.0, 14.0), (2.8, 5.5), {
+    "store": IndoorKind(0.15, (4.0, 10.0), (6.0, 14.0), (2.8, 5.5), {
         "wall": 0.8, "door": 0.15, "glazing": 0.05}, ("shelves",), 0.1, across=2.0, along=18.0,
         standers=16.0, things=0.5),
 }
 WALLS = {  # what is made, and lengths
-    "wall": (interiors.wall, 1.0, 7.0), "door": (interiors.door, 1.2, 1.7),
-    "glazing": (interiors.glazing, 2.0, 6.0), "passage": (interiors.passage, 1.8, 3.2),
-    "window": (interiors.window, 3.0, 9.0)}
-THINGS = (*interiors.PERSON_SIZED, furniture.planter, furniture.litter_bin, furniture.cabinet)
+    "wall": (interiors.make_wall, 1.0, 7.0), "door": (interiors.make_door, 1.2, 1.7),
+    "glazing": (interiors.make_glazing, 2.0, 6.0), "passage": (interiors.make_passage, 1.8, 3.2),
+    "window": (interiors.make_window, 3.0, 9.0)}
+THINGS = (*interiors.PERSON_SIZED, furniture.make_planter, furniture.make_litter_bin,
+          furniture.make_cabinet)
 
 
-def make(rng: np.random.Generator, kind: Kind,
-         people: float) -> tuple[Ground, tuple[Actor, ...], Way]:
+def make_interior(rng: np.random.Generator, kind: IndoorKind,
+                  people: float) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
     """A level floor with walls, ceiling, furniture and people, and a robot's way through it."""
-    way = swaying(rng, kind.speed, kind.stands, kind.turn)
-    room, court = Room(SECONDS, way=way, radius=ROBOT), Court.around(
-        way.sampled(SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2), rng.uniform(*kind.wide, 2))
+    way = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
+    room = Room(DRIVE_SECONDS, way=way, radius=ROBOT_RADIUS_M)
+    court = Court.around(way.sampled(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2),
+                         rng.uniform(*kind.wide, 2))
     height = rng.uniform(*kind.height)
     for side in court.sides():
-        room.add(*_walls(rng, side, kind, height))
+        room.add(*_build_walls(rng, side, kind, height))
     for what in kind.fill:
         for first, *others in FILLS[what](rng, court, height, people):
             if room.admit(first, gap=0.8 if others else 0.3):
                 room.add(*others)
     for side in court.sides():
-        for thing in against(rng, side, THINGS, kind.at_walls):
+        for thing in place_against(rng, side, THINGS, kind.at_walls):
             room.admit(thing, gap=0.05)
     for x, y in court.inner(0.8).spots(rng, kind.things):
         made = THINGS[rng.integers(len(THINGS))](rng)
-        room.admit(Actor(prop(made), x, y, rng.uniform(-np.pi, np.pi)), gap=0.3)
-    crowd.fill(rng, room, court, people, kind.along, kind.across, kind.standers)
+        room.admit(Actor(make_prop(made), x, y, rng.uniform(-np.pi, np.pi)), gap=0.3)
+    crowd.fill_court(rng, room, court, people, kind.along, kind.across, kind.standers)
     # Last, as it is in nobody's way.
-    lid = court.inner(-interiors.THICK)
-    room.add(Actor(prop(interiors.ceiling(rng, lid.x1 - lid.x0, lid.y1 - lid.y0, height)),
+    lid = court.inner(-interiors.WALL_THICKNESS_M)
+    room.add(Actor(make_prop(interiors.make_ceiling(rng, lid.x1 - lid.x0, lid.y1 - lid.y0, height)),
                    *court.centre))
     return PAVEMENT._replace(sidewalk=rng.uniform(0.2, 0.6)), tuple(room.actors), way
 
 
-def _walls(rng, side: Side, kind: Kind, height: float) -> Iterator[Actor]:
+def _build_walls(rng, side: Side, kind: IndoorKind, height: float) -> Iterator[Actor]:
     """A wall of one piece after the other, or of windows with plants before them."""
     names, shares = list(kind.walls), list(kind.walls.values())
     outer = rng.random() < kind.outer
@@ -99,78 +106,79 @@ def _walls(rng, side: Side, kind: Kind, height: float) -> Iterator[Actor]:
         made, low, high = WALLS["window" if outer else str(rng.choice(names, p=shares))]
         left = side.length - along
         if left < low + 0.5:
-            made, low, high = interiors.wall, left, left
+            made, low, high = interiors.make_wall, left, left
         length = min(rng.uniform(low, high), left)
         yield side.put(made(rng, length, height), along + length / 2, 0.0)
         along += length
     if outer:
-        yield from FRONTS["verge"](rng, side._replace(walk=OUTSIDE))
+        yield from FRONTS["verge"](rng, side._replace(walk=WINDOW_VIEW_M))
 
 
-def _columns(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
+def _place_columns(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
     """Alike, in rows."""
-    made = prop(interiors.column(rng, height))
+    made = make_prop(interiors.make_column(rng, height))
     (dx, dy), (x, y) = rng.uniform(5.0, 10.0, 2), rng.uniform(1.0, 5.0, 2)
     for at_x in np.arange(court.x0 + x, court.x1 - 1, dx):
         for at_y in np.arange(court.y0 + y, court.y1 - 1, dy):
             yield [Actor(made, at_x, at_y)]
 
 
-def _benches(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
+def _place_benches(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
     """Along the walls, and counters."""
     for side in court.sides():
-        for along in evenly_spaced(rng, side.length, rng.uniform(4.0, 12.0)):
+        for along in space_evenly(rng, side.length, rng.uniform(4.0, 12.0)):
             if rng.random() < 0.6:
-                yield crowd.bench(rng, side, along, -rng.uniform(0.4, 1.0), people)
+                yield crowd.place_bench(rng, side, along, -rng.uniform(0.4, 1.0), people)
         if rng.random() < 0.4:
-            yield [side.put(interiors.counter(rng), rng.uniform(0, side.length),
+            yield [side.put(interiors.make_counter(rng), rng.uniform(0, side.length),
                             -rng.uniform(1.2, 2.5), -np.pi / 2)]
 
 
-def _few(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
+def _scatter_tables(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
     """Tables here and there."""
     for x, y in court.inner(1.5).spots(rng, 1.5):
-        yield _table(rng, x, y, rng.uniform(-np.pi, np.pi), people)
+        yield _set_table(rng, x, y, rng.uniform(-np.pi, np.pi), people)
 
 
-def _many(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
+def _line_up_tables(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
     """Tables in rows."""
     dx, dy = rng.uniform(2.2, 3.5, 2)
     turn = np.pi / 2 * rng.integers(2)
     for x in np.arange(court.x0 + 1.3, court.x1 - 1.2, dx):
         for y in np.arange(court.y0 + 1.3, court.y1 - 1.2, dy):
             if rng.random() < 0.85:
-                yield _table(rng, x + rng.normal(0, 0.1), y + rng.normal(0, 0.1),
-                             turn + rng.normal(0, 0.05), people)
+                yield _set_table(rng, x + rng.normal(0, 0.1), y + rng.normal(0, 0.1),
+                                 turn + rng.normal(0, 0.05), people)
 
 
-def _table(rng, x: float, y: float, turn: float, people: float) -> list[Actor]:
+def _set_table(rng, x: float, y: float, turn: float, people: float) -> list[Actor]:
     """A table with chairs at its long sides, and who sits there."""
     long, wide = rng.uniform((0.7, 0.65), (2.0, 0.9))
-    table = Actor(prop(interiors.table(rng, long, wide)), x, y, turn)
+    table = Actor(make_prop(interiors.make_table(rng, long, wide)), x, y, turn)
     line, around = Side(x, y, turn, 0.0, 0.0, ""), []
-    for along in (np.arange(int(long / SEAT)) + 0.5) * SEAT - int(long / SEAT) * SEAT / 2:
+    count = int(long / SEAT_WIDTH_M)
+    for along in (np.arange(count) + 0.5) * SEAT_WIDTH_M - count * SEAT_WIDTH_M / 2:
         for side in (-1, 1):
             out, pick = side * (wide / 2 + rng.uniform(0.2, 0.4)), rng.random()
             if pick < min(0.35 * people, 0.8):
-                around.append(line.put(sitting(rng), along, out, -side * np.pi / 2))
+                around.append(line.put(make_sitting_person(rng), along, out, -side * np.pi / 2))
             elif pick < 0.85:
-                around.append(line.put(interiors.chair(rng), along, out,
+                around.append(line.put(interiors.make_chair(rng), along, out,
                                        -side * np.pi / 2 + rng.normal(0, 0.3)))
     return [table, *around]
 
 
-def _shelves(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
+def _place_shelves(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
     """Rows of them along x, with aisles between."""
     aisle, y = rng.uniform(1.6, 2.8), court.y0 + 0.5
     while y < court.y1 - 0.4:
         x = court.x0 + rng.uniform(1.0, 2.5)
         while x < court.x1 - 1.5:
             long = rng.uniform(1.0, 2.4)
-            yield [Actor(prop(interiors.shelf(rng, long)), x + long / 2, y)]
+            yield [Actor(make_prop(interiors.make_shelf(rng, long)), x + long / 2, y)]
             x += long + (0.4 if rng.random() < 0.8 else rng.uniform(1.5, 2.5))
         y += 0.7 + aisle
 
 
-FILLS = {"columns": _columns, "benches": _benches, "tables": _few, "many tables": _many,
-         "shelves": _shelves}
+FILLS = {"columns": _place_columns, "benches": _place_benches, "tables": _scatter_tables,
+         "many tables": _line_up_tables, "shelves": _place_shelves}

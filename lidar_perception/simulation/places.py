@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidar_perception.simulation.actors import Actor, prop
+from lidar_perception.simulation.actors import Actor, make_prop
 from lidar_perception.simulation.shapes.thing import Thing
-from lidar_perception.simulation.solids import extents
+from lidar_perception.simulation.solids import compute_extents
 
 
 class Side(NamedTuple):
@@ -29,7 +29,7 @@ class Side(NamedTuple):
             **moves) -> Actor:
         """An actor so far along the curb and out from it, turned against its line; parts (P,) PART
         are a thing without a label."""
-        thing = prop(thing) if isinstance(thing, np.ndarray) else thing
+        thing = make_prop(thing) if isinstance(thing, np.ndarray) else thing
         cos, sin = math.cos(self.heading), math.sin(self.heading)
         return Actor(thing, self.x + cos * along - sin * out, self.y + sin * along + cos * out,
                      self.heading + turn, **moves)
@@ -77,21 +77,21 @@ class Court(NamedTuple):
             yield rng.uniform(self.x0, self.x1), rng.uniform(self.y0, self.y1)
 
 
-def against(rng: np.random.Generator, side: Side, makers: Sequence[Callable],
-            rate: float) -> Iterator[Actor]:
+def place_against(rng: np.random.Generator, side: Side, makers: Sequence[Callable],
+                  rate: float) -> Iterator[Actor]:
     """Things within a side with their backs to it, rate of them on 100 m, each by one of makers."""
-    for along in scattered(rng, side.length, rate):
+    for along in scatter(rng, side.length, rate):
         made = makers[int(rng.integers(len(makers)))](rng)
-        low, _ = extents(made)
+        low, _ = compute_extents(made)
         yield side.put(made, along, low[:, 0].min() - 0.05, -np.pi / 2 + rng.normal(0, 0.02))
 
 
-def evenly_spaced(rng, length: float, spacing: float) -> np.ndarray:
+def space_evenly(rng, length: float, spacing: float) -> np.ndarray:
     """Places along a length, spacing apart in the mean."""
     places = np.arange(rng.uniform(0, spacing), length, spacing)
     return np.clip(places + rng.uniform(-0.2, 0.2, len(places)) * spacing, 0, length)
 
 
-def scattered(rng, length: float, rate: float) -> np.ndarray:
+def scatter(rng, length: float, rate: float) -> np.ndarray:
     """Places along a length, rate of them on 100 m in the mean, each on its own."""
     return rng.uniform(0, length, rng.poisson(max(length, 0.0) * rate / 100))

@@ -18,13 +18,19 @@ import numpy as np
 from numba import njit
 
 from lidar_perception.simulation import foliage
-from lidar_perception.simulation.edges import Met, at_edges, footprint, merged
-from lidar_perception.simulation.hashing import mixed
-from lidar_perception.simulation.pairs import shade, shapes_of, span, stop, unit_ray
-from lidar_perception.simulation.sensor import STILL, Motion, Sensor, rays
+from lidar_perception.simulation.edges import RayHit, draw_in_footprint, find_edges, merge_hits
+from lidar_perception.simulation.hashing import mix_bits
+from lidar_perception.simulation.intersection import (
+    compile_solids,
+    find_stop_range,
+    intersect_shape,
+    shade_hit,
+    to_unit_frame,
+)
+from lidar_perception.simulation.sensor import NO_MOTION, Motion, Sensor, make_rays
 from lidar_perception.simulation.solids import Solids
-from lidar_perception.simulation.terrain import Ground, cast_ground, compiled, not_before
-from lidar_perception.simulation.windows import windows
+from lidar_perception.simulation.terrain import Ground, cast_ground, min_ground_range, to_compiled
+from lidar_perception.simulation.windows import find_windows
 
 
 class Hits(NamedTuple):
@@ -52,36 +58,36 @@ class Turn(NamedTuple):
     lift: np.ndarray
 
 
-def cast(solids: Solids, ground: Ground, position: np.ndarray, sensor: Sensor,
-         motion: Motion = STILL, seed: int = 0, heading: float = 0.0) -> Hits:
+def cast_rays(solids: Solids, ground: Ground, position: np.ndarray, sensor: Sensor,
+              motion: Motion = NO_MOTION, seed: int = 0, heading: float = 0.0) -> Hits:
     """Cast all rays of one turn of a sensor at position (3,) m in the world at the stamp, over the
     ground, that looks along heading; motion: of the sensor, in its own frame; seed, a whole number
     (its lowest 64 bits count): of what is left to chance."""
-    salt = np.uint64(mixed(np.uint64(seed % (1 << 64))))
-    made = rays(sensor, motion)
+    salt = np.uint64(mix_bits(np.uint64(seed % (1 << 64))))
+    made = make_rays(sensor, motion)
     turn = Turn(made.direction, made.since, sensor.origins()[:, 2].copy())
-    seen = windows(solids, sensor, motion, sensor.divergence / 2)
-    scene = (shapes_of(solids, motion, salt), seen,
-             np.lexsort((seen.near, solids.owner, solids.owner == 0)), compiled(ground),
+    seen = find_windows(solids, sensor, motion, sensor.divergence / 2)
+    scene = (compile_solids(solids, motion, salt), seen,
+             np.lexsort((seen.near, solids.owner, solids.owner == 0)), to_compiled(ground),
              np.array(position, np.float64), np.array(motion.velocity, np.float64),
              (math.cos(heading), math.sin(heading)),
-             float(sensor.max_range), foliage.FILLED)
+             float(sensor.max_range), foliage.LEAF_SHARE)
     shape = (sensor.columns, sensor.rings)
     hits = Hits(np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape, np.int32),
                 np.empty(shape, np.uint16), np.empty(shape, np.int32),
                 np.zeros(int(solids.owner.max(initial=0)) + 1, np.int64))
-    _first(hits, turn, np.ones(shape, bool), *scene, True)
+    _cast_first(hits, turn, np.ones(shape, bool), *scene, True)
     if sensor.divergence:
-        edge, other = at_edges(hits.solid), Hits(*(np.empty_like(grid) for grid in hits))
-        _aside(turn.direction, edge, float(sensor.divergence), salt)
-        _first(other, turn, edge, *scene, False)
-        _merge(hits, other, edge, float(sensor.pulse), salt)
+        edge, other = find_edges(hits.solid), Hits(*(np.empty_like(grid) for grid in hits))
+        _turn_into_footprints(turn.direction, edge, float(sensor.divergence), salt)
+        _cast_first(other, turn, edge, *scene, False)
+        _merge_edges(hits, other, edge, float(sensor.pulse), salt)
     return hits
 
 
 @njit(cache=True, nogil=True)
-def _first(hits, turn, only, shapes, seen, order, ground, position, velocity, facing, max_range,
-           filled, counting):
+def _cast_first(hits, turn, only, shapes, seen, order, ground, position, velocity, facing,
+                max_range, filled, counting):
     """Fills the hits of only those rays, (columns, rings) bool; reached only where counting.
     order: owner by owner, then from near to far what has none."""
     hits.range[:] = np.inf
@@ -97,19 +103,19 @@ def _first(hits, turn, only, shapes, seen, order, ground, position, velocity, fa
                 way = _way(turn, column, ring)
                 start, down = (x, y, z + turn.lift[ring]), _turned(way, facing)
                 far, s = hits.range[column, ring], hits.solid[column, ring]
-                if not far < not_before(ground, start, down):
+                if not far < min_ground_range(ground, start, down):
                     met = cast_ground(ground, start, down, max_range)
                     if s < 0 or np.float32(met.range) < np.float32(far):
-                        _write(hits, column, ring, Met(met.range, met.brightness, met.cosine, 0,
-                                                       met.semantic, -1))
+                        _write_hit(hits, column, ring, RayHit(
+                            met.range, met.brightness, met.cosine, 0, met.semantic, -1))
                         continue
                 if s >= 0:
-                    brightness, cosine = shade(shapes, s, way, since, turn.lift[ring],
-                                               ring * columns + column)
-                    _write(hits, column, ring, Met(far, brightness, cosine, shapes.owner[s],
-                                                   shapes.semantic[s], s))
+                    brightness, cosine = shade_hit(shapes, s, way, since, turn.lift[ring],
+                                                   ring * columns + column)
+                    _write_hit(hits, column, ring, RayHit(far, brightness, cosine, shapes.owner[s],
+                                                          shapes.semantic[s], s))
                 else:
-                    _write(hits, column, ring, Met(np.inf, 0.0, 0.0, 0, 0, -1))
+                    _write_hit(hits, column, ring, RayHit(np.inf, 0.0, 0.0, 0, 0, -1))
 
 
 @njit(cache=True, nogil=True)
@@ -141,13 +147,14 @@ def _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, count
                 far = hits.range[column, ring]
                 if near > far and not counts:
                     continue
-                start, way = unit_ray(shapes, s, _way(turn, column, ring), turn.since[column],
-                                      turn.lift[ring])
-                enter, leave = span(shapes.kind[s], start, way)
+                start, way = to_unit_frame(shapes, s, _way(turn, column, ring), turn.since[column],
+                                           turn.lift[ring])
+                enter, leave = intersect_shape(shapes.kind[s], start, way)
                 if not (enter <= leave and leave > 0) or (
                         np.float32(enter) > np.float32(far) and not counts):
                     continue
-                t = stop(shapes, s, start, way, enter, leave, ring * columns + column, filled)
+                t = find_stop_range(shapes, s, start, way, enter, leave, ring * columns + column,
+                                    filled)
                 if not t < leave or t > max_range:
                     continue
                 if counts and latest[column, ring] != owner:
@@ -160,38 +167,40 @@ def _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, count
 
 
 @njit(cache=True, nogil=True)
-def _aside(direction, only, divergence, salt):
+def _turn_into_footprints(direction, only, divergence, salt):
     """Turns only those rays into their beams' footprints."""
     columns, rings = only.shape
     for column in range(columns):
         for ring in range(rings):
             if only[column, ring]:
                 way = direction[column, ring]
-                way[0], way[1], way[2] = footprint((way[0], way[1], way[2]), divergence,
-                                                   salt + np.uint64(ring * columns + column))
+                way[0], way[1], way[2] = draw_in_footprint(
+                    (way[0], way[1], way[2]), divergence,
+                    salt + np.uint64(ring * columns + column))
 
 
 @njit(cache=True, nogil=True)
-def _merge(hits, other, only, pulse, salt):
+def _merge_edges(hits, other, only, pulse, salt):
     """Joins what the two rays of only those beams meet, into hits."""
     columns, rings = only.shape
     for column in range(columns):
         for ring in range(rings):
             if only[column, ring]:
-                _write(hits, column, ring, merged(
-                    _met(hits, column, ring), _met(other, column, ring), pulse,
+                _write_hit(hits, column, ring, merge_hits(
+                    _read_hit(hits, column, ring), _read_hit(other, column, ring), pulse,
                     salt + np.uint64(ring * columns + column)))
 
 
 @njit(cache=True, nogil=True)
-def _met(hits, column, ring):
-    return Met(hits.range[column, ring], hits.brightness[column, ring], hits.cosine[column, ring],
-               np.int64(hits.owner[column, ring]), np.int64(hits.semantic[column, ring]),
-               np.int64(hits.solid[column, ring]))
+def _read_hit(hits, column, ring):
+    return RayHit(hits.range[column, ring], hits.brightness[column, ring],
+                  hits.cosine[column, ring],
+                  np.int64(hits.owner[column, ring]), np.int64(hits.semantic[column, ring]),
+                  np.int64(hits.solid[column, ring]))
 
 
 @njit(cache=True, nogil=True)
-def _write(hits, column, ring, met):
+def _write_hit(hits, column, ring, met):
     hits.range[column, ring] = met.range
     hits.brightness[column, ring] = met.brightness
     hits.cosine[column, ring] = met.cosine

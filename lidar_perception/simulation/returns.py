@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidar_perception.simulation.raycast import Hits
-from lidar_perception.simulation.sensor import STILL, Motion, Sensor, rays
+from lidar_perception.simulation.sensor import NO_MOTION, Motion, Sensor, make_rays
 from lidar_perception.simulation.solids import RETROREFLECTOR
 
 # How a grazed surface weakens a return, as a power of the cosine of the incidence, and how the
@@ -15,11 +15,11 @@ from lidar_perception.simulation.solids import RETROREFLECTOR
 # scans (median) 0.7 of the rays return from 38 m, 0.5 from 43 m, 0.35 from 50 m and none from 60 m.
 # Losses come in runs: on a SemanticKITTI scan only 0.03 of the returns of the road beyond 35 m are
 # missing between others.
-GRAZING = 1 / 3
-SCATTER, RUN = 0.5, 16  # RUN: columns
+GRAZING_EXPONENT = 1 / 3
+POWER_SCATTER, SCATTER_COLUMNS = 0.5, 16  # RUN: columns
 # Of the intensity: so much neighbouring points of one beam differ on the road, sidewalks (0.03) and
 # facades (0.04) of a SemanticKITTI scan (robust standard deviation).
-SPECKLE = 0.035
+INTENSITY_NOISE = 0.035
 
 
 class Returns(NamedTuple):
@@ -36,7 +36,7 @@ class Returns(NamedTuple):
     time: np.ndarray
 
 
-def returns_of(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Generator,
+def make_returns(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Generator,
             compensated: bool = True) -> Returns:
     """What the sensor reports. compensated: the points are where they were met, in the frame at
     the stamp, as KITTI publishes them; otherwise as if the sensor had stood still.
@@ -45,28 +45,28 @@ def returns_of(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Genera
     of a surface of brightness 0.1 that faces the sensor at sensor.reach.
     """
     shape = hits.range.shape
-    turn = rays(sensor, motion if compensated else STILL)
+    turn = make_rays(sensor, motion if compensated else NO_MOTION)
     noisy = hits.range + rng.normal(0.0, sensor.range_noise, shape)
     if sensor.offsets:
         noisy += np.asarray(sensor.offsets)
     with np.errstate(divide="ignore", invalid="ignore"):  # no range over an endless reach: NaN
-        power = (np.log(hits.brightness / 0.1) + GRAZING * np.log(hits.cosine)
+        power = (np.log(hits.brightness / 0.1) + GRAZING_EXPONENT * np.log(hits.cosine)
                  - 2 * np.log(hits.range / sensor.reach))
-    scatter = rng.normal(0.0, SCATTER, (-(-shape[0] // RUN), shape[1]))
-    keep = power > np.repeat(scatter, RUN, axis=0)[:shape[0]]
+    scatter = rng.normal(0.0, POWER_SCATTER, (-(-shape[0] // SCATTER_COLUMNS), shape[1]))
+    keep = power > np.repeat(scatter, SCATTER_COLUMNS, axis=0)[:shape[0]]
     keep &= (rng.random(shape) >= sensor.dropout) & sensor.open_rays()
     # A hair within the limits, so that rounding to float32 does not step over them.
     keep &= (noisy > sensor.min_range + 1e-4) & (noisy < sensor.max_range - 1e-4)
     ring, column = np.nonzero(keep.T)
     origin = np.broadcast_to(turn.origin, turn.direction.shape)
     xyz = origin[column, ring] + turn.direction[column, ring] * noisy[column, ring, None]
-    intensity = hits.brightness[column, ring] + rng.normal(0.0, SPECKLE, len(ring))
+    intensity = hits.brightness[column, ring] + rng.normal(0.0, INTENSITY_NOISE, len(ring))
     faded = sensor.fade[1] * np.maximum(hits.range[column, ring] - sensor.fade[0], 0.0)
     intensity -= np.where(hits.brightness[column, ring] < RETROREFLECTOR, faded, 0.0)
     weak = (intensity < sensor.floor) | (rng.random(len(intensity)) < sensor.silent)
     if sensor.biases:
         intensity += np.asarray(sensor.biases)[ring]
     intensity = np.where(weak, 0.0, np.round(np.clip(intensity, 0.0, 1.0), 2))
-    time = rays(sensor, motion).since[column]
+    time = make_rays(sensor, motion).since[column]
     return Returns(xyz.astype(np.float32), intensity.astype(np.float32), hits.owner[column, ring],
                    hits.semantic[column, ring], ring.astype(np.uint16), time.astype(np.float32))

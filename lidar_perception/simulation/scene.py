@@ -15,18 +15,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidar_perception.simulation import campus, indoor
-from lidar_perception.simulation.actors import FAR_SIGHT, LARGE, SIGHT, Actor, Room
+from lidar_perception.simulation.actors import FAR_SIGHT_M, LARGE_M, SIGHT_M, Actor, Room
 from lidar_perception.simulation.roadside import furnish
 from lidar_perception.simulation.sensor import Motion
-from lidar_perception.simulation.solids import PART, Solids, hull, place
-from lidar_perception.simulation.street import KINDS, Kind, lay_out
+from lidar_perception.simulation.solids import PART, Solids, compute_hull, place_parts
+from lidar_perception.simulation.street import STREET_KINDS, StreetKind, draw_street
 from lidar_perception.simulation.terrain import Ground, surface_height
 from lidar_perception.simulation.traffic import populate
-from lidar_perception.simulation.way import SECONDS, Way
+from lidar_perception.simulation.trajectory import DRIVE_SECONDS, Trajectory
 from lidar_perception.types import CLASSES, InputError, did_you_mean
 
-MOST_PEOPLE = 100  # times as many as usual; a street then takes 3 s, and has no room for more
-EGO = (3.0, 1.1)  # half length and width that the ego vehicle keeps clear, m
+MAX_PEOPLE = 100  # times as many as usual; a street then takes 3 s, and has no room for more
+EGO_HALF_SIZE_M = (3.0, 1.1)  # half length and width that the ego vehicle keeps clear, m
 
 
 class Scenes(NamedTuple):
@@ -37,21 +37,22 @@ class Scenes(NamedTuple):
     people: float = 1.0
     scene: str = "street"
 
-    def sorts(self) -> list[Sort]:
+    def sorts(self) -> list[SceneType]:
         """In the order of their turns. InputError for an unknown scene or kind, and people that
         cannot be."""
-        if not 0 <= self.people <= MOST_PEOPLE:
-            raise InputError(f"people = {self.people} must be 0 .. {MOST_PEOPLE}, such as 1")
+        if not 0 <= self.people <= MAX_PEOPLE:
+            raise InputError(f"people = {self.people} must be 0 .. {MAX_PEOPLE}, such as 1")
         names = self.scene.split(",")
-        if unknown := [name for name in names if name not in SCENES]:
-            raise InputError(f"unknown scene {unknown[0]!r}: must be one of {', '.join(SCENES)}, "
-                             f"or several with commas between{did_you_mean(unknown[0], SCENES)}")
+        if unknown := [name for name in names if name not in SCENE_TYPES]:
+            raise InputError(f"unknown scene {unknown[0]!r}: must be one of "
+                             f"{', '.join(SCENE_TYPES)}, or several separated by commas"
+                             f"{did_you_mean(unknown[0], SCENE_TYPES)}")
         for name in names:
-            if self.kind is not None and self.kind not in SCENES[name].kinds:
+            if self.kind is not None and self.kind not in SCENE_TYPES[name].kinds:
                 raise InputError(f"kind = {self.kind!r} must be one of "
-                                 f"{', '.join(SCENES[name].kinds)} where scene is {name}"
-                                 f"{did_you_mean(self.kind, SCENES[name].kinds)}")
-        return [SCENES[name] for name in names]
+                                 f"{', '.join(SCENE_TYPES[name].kinds)} where scene is {name}"
+                                 f"{did_you_mean(self.kind, SCENE_TYPES[name].kinds)}")
+        return [SCENE_TYPES[name] for name in names]
 
     @property
     def camera(self) -> bool:
@@ -59,11 +60,11 @@ class Scenes(NamedTuple):
         return all(sort.camera for sort in self.sorts())
 
 
-ANY = Scenes()
-CROWDED = Scenes("zone", 3.0)  # for demos and tests of pedestrian detectors
+ALL_STREETS = Scenes()
+CROWDED_ZONES = Scenes("zone", 3.0)  # for demos and tests of pedestrian detectors
 
 
-class Moment(NamedTuple):
+class SceneMoment(NamedTuple):
     """The scene at one time, as the sensor at position (3,) in the world, which looks along
     heading, finds it. boxes (K, 7) as in GroundTruth, class_ids (K,) int32, track_ids (K,) int32
     in 1.., which are also the solids' owners, speeds (K,) m/s over the ground, motion of the
@@ -87,9 +88,9 @@ class Scene:
 
     ground: Ground
     actors: tuple[Actor, ...]
-    way: Way = Way()
+    way: Trajectory = Trajectory()
     kind: str = ""
-    seconds: float = SECONDS
+    seconds: float = DRIVE_SECONDS
 
     def sensor_pose(self, t: float, sensor_height: float) -> np.ndarray:
         """(4, 4) float64 from the sensor's frame after t seconds to the world."""
@@ -100,7 +101,7 @@ class Scene:
                        surface_height(self.ground, along.x, along.y) + sensor_height)
         return pose
 
-    def at(self, t: float, sensor_height: float) -> Moment:
+    def at(self, t: float, sensor_height: float) -> SceneMoment:
         """The scene after t seconds, relative to a sensor so high above the ground."""
         along, pose = self.way.at(t), self.sensor_pose(t, sensor_height)
         sensor, turned = pose[:3, 3].copy(), pose[:3, :3]
@@ -118,16 +119,16 @@ class Scene:
 
         made = [self.actors[i].thing.parts(s) for i, s in zip(near.tolist(), way.tolist())]
         whose = np.repeat(np.arange(len(made)), [len(m) for m in made])
-        solids = place(_joined(made), base[whose], heading[whose], a["track"][whose],
-                       velocity[whose])
+        solids = place_parts(_join_parts(made), base[whose], heading[whose], a["track"][whose],
+                             velocity[whose])
 
         known = np.flatnonzero(a["track"])
         boxes = np.column_stack([base, a["size"], heading])[known]
         boxes[:, 2] += boxes[:, 5] / 2
         moved = (self._climbing(np.array([along.velocity])) @ turned)[0]
         motion = Motion(tuple(moved.tolist()), along.yaw_rate)
-        return Moment(solids, sensor, along.heading, boxes, a["class"][known], a["track"][known],
-                      speed[known], motion)
+        return SceneMoment(solids, sensor, along.heading, boxes, a["class"][known],
+                           a["track"][known], speed[known], motion)
 
     @cached_property
     def _table(self) -> np.ndarray:
@@ -135,13 +136,13 @@ class Scene:
         has no label, which may be too long to stand on a slope; NaN for the rest."""
         rows = []
         for a in self.actors:
-            x0, y0, z0, x1, y1, z1 = hull(a.thing.parts(0.0))
+            x0, y0, z0, x1, y1, z1 = compute_hull(a.thing.parts(0.0))
             level, span = math.hypot(x1 - x0, y1 - y0), max(x1 - x0, y1 - y0, z1 - z0)
             label = a.thing.label
             rows.append(((a.x, a.y), a.heading, (math.cos(a.heading), math.sin(a.heading)),
                          a.speed, a.start, a.stop, a.thing.size,
                          CLASSES.index(label) if label else -1, 0,
-                         level / 2 + (FAR_SIGHT if span > LARGE else SIGHT), np.nan))
+                         level / 2 + (FAR_SIGHT_M if span > LARGE_M else SIGHT_M), np.nan))
         table = np.array(rows, [
             ("xy", float, 2), ("heading", float), ("forward", float, 2), ("speed", float),
             ("start", float), ("stop", float), ("size", float, 3), ("class", np.int32),
@@ -149,7 +150,8 @@ class Scene:
         known = table["class"] >= 0
         table["track"] = np.where(known, np.cumsum(known), 0)
         fixed = np.flatnonzero((table["speed"] == 0) & ~known)
-        corners = _corners(np.array([self.actors[i].footprint for i in fixed]).reshape(-1, 8))
+        footprints = np.array([self.actors[i].footprint for i in fixed]).reshape(-1, 8)
+        corners = _compute_corners(footprints)
         table["feet"][fixed] = surface_height(self.ground, *corners).min(axis=1)
         return table
 
@@ -159,7 +161,7 @@ class Scene:
         return np.column_stack([flat, flat @ slope])
 
 
-def _joined(made: list[np.ndarray]) -> np.ndarray:
+def _join_parts(made: list[np.ndarray]) -> np.ndarray:
     """All parts (P,) PART in a row; np.concatenate takes as long as casting them."""
     whole = np.empty(sum(map(len, made)), PART)
     end = 0
@@ -169,7 +171,7 @@ def _joined(made: list[np.ndarray]) -> np.ndarray:
     return whole
 
 
-def _corners(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _compute_corners(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """x and y (A, 4) of the corners of footprints (A, 8) at time 0."""
     x, y, heading, length, width = f[:, :5, None].transpose(1, 0, 2)
     ahead, aside = length * np.array([1, 1, -1, -1]), width * np.array([1, -1, 1, -1])
@@ -184,7 +186,7 @@ def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0,
     streets 1 comes near KITTI's labels, 0 is none. scene: see Scenes.
 
     What is placed later is dropped where it would ever touch what is there already. InputError
-    for a negative seed, people beyond 0 .. MOST_PEOPLE and an unknown scene or kind.
+    for a negative seed, people beyond 0 .. MAX_PEOPLE and an unknown scene or kind.
     """
     if seed < 0:
         raise InputError(f"seed = {seed} must not be negative")
@@ -196,26 +198,27 @@ def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0,
     return Scene(*chosen.make(rng, chosen.kinds[kind], people), kind)
 
 
-def _street(rng: np.random.Generator, kind: Kind,
-            people: float) -> tuple[Ground, tuple[Actor, ...], Way]:
+def _make_street(rng: np.random.Generator, kind: StreetKind,
+                 people: float) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
     """A street along x, and a car that drives at y = 0."""
-    street = lay_out(rng, kind, SECONDS)
-    ego = [0.0, 0.0, 0.0, *EGO, street.speed, 0.0, np.inf]
-    room = Room(SECONDS, np.array([ego]))
+    street = draw_street(rng, kind, DRIVE_SECONDS)
+    ego = [0.0, 0.0, 0.0, *EGO_HALF_SIZE_M, street.speed, 0.0, np.inf]
+    room = Room(DRIVE_SECONDS, np.array([ego]))
     furnish(rng, street, room)
     populate(rng, street, room, people)
-    return street.ground, tuple(room.actors), Way(street.speed)
+    return street.ground, tuple(room.actors), Trajectory(street.speed)
 
 
-class Sort(NamedTuple):
+class SceneType(NamedTuple):
     """A sort of scene: its kinds by name, each with the share that it is drawn with; make(rng,
     kind, people): ground, actors and way; camera: see Scenes."""
 
     kinds: dict[str, Any]
-    make: Callable[[np.random.Generator, Any, float], tuple[Ground, tuple[Actor, ...], Way]]
+    make: Callable[[np.random.Generator, Any, float], tuple[Ground, tuple[Actor, ...], Trajectory]]
     camera: bool = False
 
 
-SCENES = {"street": Sort(KINDS, _street, camera=True), "campus": Sort(campus.KINDS, campus.make),
-          "indoor": Sort(indoor.KINDS, indoor.make)}
+SCENE_TYPES = {"street": SceneType(STREET_KINDS, _make_street, camera=True),
+               "campus": SceneType(campus.CAMPUS_KINDS, campus.make_campus),
+               "indoor": SceneType(indoor.INDOOR_KINDS, indoor.make_interior)}
 

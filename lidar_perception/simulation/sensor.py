@@ -17,7 +17,7 @@ from lidar_perception.types import SENSOR_HEIGHT, InputError, did_you_mean
 
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where it was built
 MAX_BYTES = 1 << 20  # of a file that describes a sensor
-GOLDEN = 0.6180339887498949
+GOLDEN_RATIO = 0.6180339887498949
 MAX_RATE = 1000.0  # turns a second
 MAX_NOISE = 1.0    # metres
 MAX_BEAMS = 1 << 16  # as many rings as uint16 has
@@ -105,7 +105,7 @@ class Sensor:
         same part of wander, and over the turns the parts fill it evenly (golden ratio)."""
         if not self.wander:
             return self
-        lower = self.wander * (number * GOLDEN % 1.0)
+        lower = self.wander * (number * GOLDEN_RATIO % 1.0)
         return replace(self, elevations=tuple(up - lower for up in self.elevations))
 
     def directions(self) -> np.ndarray:
@@ -147,7 +147,7 @@ class Motion(NamedTuple):
     stamp: float = 0.5
 
 
-STILL = Motion()
+NO_MOTION = Motion()
 
 
 class Rays(NamedTuple):
@@ -159,7 +159,7 @@ class Rays(NamedTuple):
     since: np.ndarray
 
 
-def rays(sensor: Sensor, motion: Motion = STILL) -> Rays:
+def make_rays(sensor: Sensor, motion: Motion = NO_MOTION) -> Rays:
     """Where the rays start and go while the sensor moves."""
     since = sensor.times() - motion.stamp / sensor.rate
     moved = since[:, None] * np.asarray(motion.velocity, np.float64)
@@ -172,8 +172,8 @@ def rays(sensor: Sensor, motion: Motion = STILL) -> Rays:
     return Rays(moved[:, None] + sensor.origins(), direction, since)
 
 
-def generic(beams: int, lowest: float, highest: float, azimuth_step: float, rate: float,
-            **fields: Any) -> Sensor:
+def make_generic_sensor(beams: int, lowest: float, highest: float, azimuth_step: float, rate: float,
+                        **fields: Any) -> Sensor:
     """A sensor of evenly spaced beams; angles in degrees, rate in turns per second, and any other
     field of Sensor by name. InputError for impossible values."""
     if beams > MAX_BEAMS:  # before there is a list of them
@@ -184,7 +184,7 @@ def generic(beams: int, lowest: float, highest: float, azimuth_step: float, rate
                   float(np.radians(azimuth_step)), rate=rate, **fields)
 
 
-def sensor_from_file(path: str | Path) -> Sensor:
+def load_sensor(path: str | Path) -> Sensor:
     """The sensor that a YAML file describes: the fields of Sensor by name, all angles in degrees
     (divergence and wander, too), and a name for people. What is not given has its default;
     elevations, azimuth_step and rate must be. sensors/*.yaml are examples, and `setup` writes one.
@@ -205,19 +205,19 @@ def sensor_from_file(path: str | Path) -> Sensor:
     if missing := [key for key in ("elevations", "azimuth_step", "rate") if key not in values]:
         raise InputError(f"{path}: {missing[0]} is missing; {remedy}")
     try:
-        return Sensor(**{key: _read(key, value) for key, value in values.items()})
+        return Sensor(**{key: _convert_field(key, value) for key, value in values.items()})
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
-SHAPES = {"elevations": (0,), "lifts": (0,), "offsets": (0,), "biases": (0,), "fade": (2,),
-          "blocked": (0, 3)}  # of the fields that are no single number; 0: any length
-IN_DEGREES = ("elevations", "azimuth_step", "divergence", "wander")
+FIELD_SHAPES = {"elevations": (0,), "lifts": (0,), "offsets": (0,), "biases": (0,), "fade": (2,),
+                "blocked": (0, 3)}  # of the fields that are no single number; 0: any length
+DEGREE_FIELDS = ("elevations", "azimuth_step", "divergence", "wander")
 
 
-def _read(key: str, value: Any) -> Any:
+def _convert_field(key: str, value: Any) -> Any:
     """A value of the file in the unit of the field; InputError where it is of the wrong kind."""
-    shape = SHAPES.get(key, ())
+    shape = FIELD_SHAPES.get(key, ())
     if value == [] and shape[:1] == (0,):
         return ()
     try:
@@ -225,41 +225,41 @@ def _read(key: str, value: Any) -> Any:
     except (TypeError, ValueError, OverflowError):
         numbers = np.full((0,) * 9, np.nan)
     if numbers.ndim != len(shape) or any(n not in (0, m) for n, m in zip(shape, numbers.shape)) or (
-            np.isnan(numbers).any()) or (len(shape) == 2 and not _whole(numbers[:, 0])):
+            np.isnan(numbers).any()) or (len(shape) == 2 and not _are_whole(numbers[:, 0])):
         what = "a number" if not shape else "a list of " + (
             f"{shape[0] or ''} numbers".strip() if len(shape) == 1 else "[ring, from, to]")
         raise InputError(f"{key} = {reprlib.repr(value)[:60]} must be {what}")
-    rows = (np.radians(numbers) if key in IN_DEGREES else numbers).tolist()
+    rows = (np.radians(numbers) if key in DEGREE_FIELDS else numbers).tolist()
     if not shape:
         return rows
     return tuple((int(row[0]), *row[1:]) for row in rows) if len(shape) == 2 else tuple(rows)
 
 
-def _whole(numbers: np.ndarray) -> bool:
+def _are_whole(numbers: np.ndarray) -> bool:
     return bool(np.isfinite(numbers).all() and (numbers == np.floor(numbers)).all())
 
 
-def _key(name: str) -> str:
+def _normalize_name(name: str) -> str:
     """A sensor's name without what people write in different ways."""
     return "".join(c for c in name.lower() if c.isalnum())
 
 
-READY = {_key(path.stem): path for path in sorted(
+PRESET_FILES = {_normalize_name(path.stem): path for path in sorted(
     (Path(__file__).parent / "sensors").glob("*.yaml"))}  # described by files of the package
 
 
 @cache
-def _ready(key: str) -> Sensor:
-    return sensor_from_file(READY[key])
+def _load_preset(key: str) -> Sensor:
+    return load_sensor(PRESET_FILES[key])
 
 
-HDL64E = _ready("hdl64e")
+HDL64E = _load_preset("hdl64e")
 SENSORS: dict[str, Sensor] = {"hdl64e": HDL64E}  # and those of READY
-NAMES = tuple(path.stem for path in READY.values())
-GENERIC = "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE (degrees, turns a second)"
+SENSOR_NAMES = tuple(path.stem for path in PRESET_FILES.values())
+GENERIC_FORMAT = "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE (degrees, turns a second)"
 
 
-def hdl64e(rate: float = 10.0) -> Sensor:
+def make_hdl64e(rate: float = 10.0) -> Sensor:
     """KITTI's HDL-64E S2 at so many turns per second, 5 to 20: the lasers fire at a fixed rate, so
     that a slower turn is a finer one. InputError for another rate."""
     if not 5 <= rate <= 20:
@@ -268,31 +268,31 @@ def hdl64e(rate: float = 10.0) -> Sensor:
     return replace(HDL64E, azimuth_step=2 * np.pi / columns, rate=rate)
 
 
-def sensor_named(name: str, height: float = 0.0) -> Sensor:
-    """The sensor of a YAML file (see sensor_from_file), the one of that name, however it is
+def find_sensor(name: str, height: float = 0.0) -> Sensor:
+    """The sensor of a YAML file (see load_sensor), the one of that name, however it is
     written (vlp-16, VLP16), or a generic one as GENERIC says; at another height above the ground if
     that is not 0, metres. InputError, which names them all, for anything else."""
-    sensor = _named(name)
+    sensor = _find_by_name(name)
     return replace(sensor, height=height) if height else sensor
 
 
-def _named(name: str) -> Sensor:
+def _find_by_name(name: str) -> Sensor:
     if name.startswith("generic:"):
         try:
             beams, *numbers = map(float, name.removeprefix("generic:").split(","))
             if beams % 1:  # NaN is no whole number, either
                 raise ValueError
-            return generic(int(beams), *numbers)
+            return make_generic_sensor(int(beams), *numbers)
         except (TypeError, ValueError, OverflowError) as error:
             if isinstance(error, InputError):
                 raise
-            raise InputError(f"sensor {name!r} must be {GENERIC}, such as "
+            raise InputError(f"sensor {name!r} must be {GENERIC_FORMAT}, such as "
                              "generic:32,-25,15,0.2,10") from None
     if name.endswith((".yaml", ".yml")):
-        return sensor_from_file(name)
+        return load_sensor(name)
     if name in SENSORS:
         return SENSORS[name]
-    if _key(name) not in READY:
-        raise InputError(f"unknown sensor {name!r}: must be one of {', '.join(NAMES)}, a file "
-                         f".yaml, or {GENERIC}{did_you_mean(name, NAMES)}")
-    return _ready(_key(name))
+    if _normalize_name(name) not in PRESET_FILES:
+        raise InputError(f"unknown sensor {name!r}: must be one of {', '.join(SENSOR_NAMES)}, a "
+                         f".yaml file, or {GENERIC_FORMAT}{did_you_mean(name, SENSOR_NAMES)}")
+    return _load_preset(_normalize_name(name))

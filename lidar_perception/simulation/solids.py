@@ -71,8 +71,8 @@ class Solids:
         return Solids(*(getattr(self, f.name)[places] for f in fields(self)))
 
 
-def place(made: np.ndarray, base: np.ndarray, heading: np.ndarray, owner: np.ndarray,
-          velocity: np.ndarray) -> Solids:
+def place_parts(made: np.ndarray, base: np.ndarray, heading: np.ndarray, owner: np.ndarray,
+                velocity: np.ndarray) -> Solids:
     """The solids of parts (P,) PART of things that stand at base (P, 3) and look along heading
     (P,); owner (P,) and velocity (P, 3) are copied."""
     cos, sin = np.cos(made["yaw"] + heading), np.sin(made["yaw"] + heading)
@@ -89,14 +89,14 @@ def place(made: np.ndarray, base: np.ndarray, heading: np.ndarray, owner: np.nda
                   np.asarray(owner, np.int32), np.asarray(velocity, np.float64))
 
 
-def extents(made: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def compute_extents(made: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(P, 3) lower and (P, 3) upper bounds of each part, exact, in the thing's frame."""
     low, high = np.empty((len(made), 3)), np.empty((len(made), 3))
     _extents(made, low, high)
     return low, high
 
 
-def hull(made: np.ndarray, below: float = np.inf) -> tuple[float, ...]:
+def compute_hull(made: np.ndarray, below: float = np.inf) -> tuple[float, ...]:
     """Bounds of all parts (P,) PART of which something is lower than that: least x, y, z, greatest
     x, y, z, in the thing's frame; inf and -inf where there are none."""
     return _hull(made, below)

@@ -10,14 +10,15 @@ import numpy as np
 from lidar_perception.simulation.places import Side
 from lidar_perception.simulation.terrain import Ground
 
-BEHIND, AHEAD = 100.0, 130.0  # metres of street behind the start and beyond the end of a drive
-CORNER = 2.5                  # sidewalk along a side street, m
-ARM = 60.0                    # length of a side street, m
-PARALLEL, ACROSS = 2.2, 5.0   # widths of parking strips: cars along the curb, or nose to it
+BEHIND_M, AHEAD_M = 100.0, 130.0  # metres of street behind the start and beyond the end of a drive
+CORNER_WALK_M = 2.5                  # sidewalk along a side street, m
+ARM_LENGTH_M = 60.0                    # length of a side street, m
+# Widths of parking strips: cars along the curb, or nose to it.
+PARALLEL_STRIP_M, ACROSS_STRIP_M = 2.2, 5.0
 
 
 @dataclass(frozen=True)
-class Kind:
+class StreetKind:
     """Ranges (low, high) are drawn from uniformly; lengths in metres, speeds in m/s; shares,
     chances and the weights of fronts are in 0 .. 1; rates count per 100 m."""
 
@@ -47,23 +48,25 @@ class Kind:
     riders: float = 0.3
 
 
-KINDS = {
-    "city": Kind(0.28, {"facade": 0.4, "garden": 0.2, "verge": 0.4}, cycle=0.25, parking=0.65,
-                 across=0.15, walk=(2.0, 4.5), rails=0.05, clutter=7, walkers=4.8, standers=0.17,
-                 riders=0.5, crossing=(45, 100)),
-    "residential": Kind(0.30, {"garden": 0.8, "facade": 0.1, "verge": 0.1}, lane=(2.8, 3.2),
-                        parking=0.5, walk=(1.5, 2.4), speed=(2.0, 9.0), headway=12.0, tree=3.0,
-                        stands=0.1, walkers=1.3, standers=0.05, seats=0.02, riders=0.3),
-    "arterial": Kind(0.20, {"verge": 0.8, "facade": 0.1, "wild": 0.1}, lane=(3.2, 3.7),
-                     beside=(0, 2), oncoming=(1, 3), rails=0.4, cycle=0.4, parking=0.15,
-                     walk=(2.0, 3.5), crossing=(90, 200), speed=(5.0, 14.0), headway=3.0,
-                     tree=5.0, walkers=1.3, riders=0.5),
-    "country": Kind(0.13, {"wild": 1.0}, walk=(0.0, 0.0), curb=0.0, crossing=(150, 400),
-                    speed=(7.0, 14.0), stands=0.05, headway=5.0, lamp=0.5, tree=0.0, clutter=1.0,
-                    walkers=0.2, standers=0.0, seats=0.0, riders=0.2),
-    "zone": Kind(0.09, {"facade": 0.6, "square": 0.4}, walk=(4.0, 8.0), curb=0.03, rails=0.1,
-                 speed=(0.5, 3.5), stands=0.4, headway=40.0, tree=3.0, clutter=8.0, walkers=13.2,
-                 standers=0.5, seats=0.3, riders=1.5, crossing=(40, 80), parking=0.1),
+STREET_KINDS = {
+    "city": StreetKind(0.28, {"facade": 0.4, "garden": 0.2, "verge": 0.4}, cycle=0.25, parking=0.65,
+                       across=0.15, walk=(2.0, 4.5), rails=0.05, clutter=7, walkers=4.8,
+                       standers=0.17, riders=0.5, crossing=(45, 100)),
+    "residential": StreetKind(0.30, {"garden": 0.8, "facade": 0.1, "verge": 0.1}, lane=(2.8, 3.2),
+                              parking=0.5, walk=(1.5, 2.4), speed=(2.0, 9.0), headway=12.0,
+                              tree=3.0, stands=0.1, walkers=1.3, standers=0.05, seats=0.02,
+                              riders=0.3),
+    "arterial": StreetKind(0.20, {"verge": 0.8, "facade": 0.1, "wild": 0.1}, lane=(3.2, 3.7),
+                           beside=(0, 2), oncoming=(1, 3), rails=0.4, cycle=0.4, parking=0.15,
+                           walk=(2.0, 3.5), crossing=(90, 200), speed=(5.0, 14.0), headway=3.0,
+                           tree=5.0, walkers=1.3, riders=0.5),
+    "country": StreetKind(0.13, {"wild": 1.0}, walk=(0.0, 0.0), curb=0.0, crossing=(150, 400),
+                          speed=(7.0, 14.0), stands=0.05, headway=5.0, lamp=0.5, tree=0.0,
+                          clutter=1.0, walkers=0.2, standers=0.0, seats=0.0, riders=0.2),
+    "zone": StreetKind(0.09, {"facade": 0.6, "square": 0.4}, walk=(4.0, 8.0), curb=0.03, rails=0.1,
+                       speed=(0.5, 3.5), stands=0.4, headway=40.0, tree=3.0, clutter=8.0,
+                       walkers=13.2, standers=0.5, seats=0.3, riders=1.5, crossing=(40, 80),
+                       parking=0.1),
 }
 
 
@@ -80,7 +83,7 @@ class Street(NamedTuple):
     """What lay_out drew. blocks: sides between the crossings; arms: sides of the side streets.
     speed of the ego vehicle."""
 
-    kind: Kind
+    kind: StreetKind
     ground: Ground
     lanes: tuple[Lane, ...]
     blocks: tuple[Side, ...]
@@ -90,15 +93,15 @@ class Street(NamedTuple):
     end: float
 
 
-def lay_out(rng: np.random.Generator, kind: Kind, seconds: float) -> Street:
+def draw_street(rng: np.random.Generator, kind: StreetKind, seconds: float) -> Street:
     """A street long enough for a drive of so many seconds."""
     speed = 0.0 if rng.random() < kind.stands else rng.uniform(*kind.speed)
-    start, end = -BEHIND, speed * seconds + AHEAD
+    start, end = -BEHIND_M, speed * seconds + AHEAD_M
     parking = 0.0
     if rng.random() < kind.parking:
-        parking = ACROSS if rng.random() < kind.across else PARALLEL
-    lanes, right, left = _lanes(rng, kind, speed, parking)
-    walk, crossings = rng.uniform(*kind.walk), _crossings(rng, kind, start, end)
+        parking = ACROSS_STRIP_M if rng.random() < kind.across else PARALLEL_STRIP_M
+    lanes, right, left = _draw_lanes(rng, kind, speed, parking)
+    walk, crossings = rng.uniform(*kind.walk), _draw_crossings(rng, kind, start, end)
     # Slopes of 27 scans of KITTI: 0.67 +- 0.2 degrees ahead (the sensor's own pitch), +- 0.45
     # aside. Heights of grass and litter are such that cells of 1 m beside the road scatter about
     # their planes as on KITTI: 5 to 40 m away 3 to 5 cm at the upper quartile, 36 to 52 % of them
@@ -120,25 +123,26 @@ def lay_out(rng: np.random.Generator, kind: Kind, seconds: float) -> Street:
             front = front if rng.random() < 0.7 else rng.choice(names, p=weights)
             blocks.append(Side(low if y > 0 else high, y, heading, high - low, walk, str(front),
                                parking))
-    arms = [_arm(rng.choice(fronts), x, land, curb, up, walk, parked_width(crossing))
+    arms = [_make_arm(rng.choice(fronts), x, land, curb, up, walk, parking_width(crossing))
             for crossing in crossings for curb, up in ((left, 1), (right, -1))
             for x, land in zip(crossing, (-1, 1))]
     return Street(kind, ground, lanes, tuple(blocks), tuple(arms), speed, start, end)
 
 
-def _lanes(rng, kind: Kind, speed: float, parking: float) -> tuple[tuple[Lane, ...], float, float]:
+def _draw_lanes(rng, kind: StreetKind, speed: float,
+                parking: float) -> tuple[tuple[Lane, ...], float, float]:
     """The lanes, ours first, and the curbs right and left of them."""
     width = rng.uniform(*kind.lane)
     lanes, right = [Lane(0.0, 1, speed)], -width / 2
     for _ in range(rng.integers(*kind.beside)):
-        lanes.append(Lane(right - width / 2, 1, _lane_speed(rng, kind)))
+        lanes.append(Lane(right - width / 2, 1, _draw_lane_speed(rng, kind)))
         right -= width
     left, use = width / 2, ["road"] * rng.integers(*kind.oncoming)
     ways = [-1] * len(use)
     if rng.random() < kind.rails:
         use, ways = ["rail", "rail", *use], [1, -1, *ways]
     for what, way in zip(use, ways):
-        lanes.append(Lane(left + width / 2, way, _lane_speed(rng, kind), what))
+        lanes.append(Lane(left + width / 2, way, _draw_lane_speed(rng, kind), what))
         left += width
     strip = 1.6 if rng.random() < kind.cycle else 0.0
     if strip:
@@ -148,29 +152,30 @@ def _lanes(rng, kind: Kind, speed: float, parking: float) -> tuple[tuple[Lane, .
     return tuple(lanes), right - edge, left + edge
 
 
-def _lane_speed(rng, kind: Kind) -> float:
+def _draw_lane_speed(rng, kind: StreetKind) -> float:
     return 0.0 if rng.random() < kind.stands else rng.uniform(*kind.speed)
 
 
-def _crossings(rng, kind: Kind, start: float, end: float) -> tuple[tuple[float, float], ...]:
+def _draw_crossings(rng, kind: StreetKind, start: float,
+                    end: float) -> tuple[tuple[float, float], ...]:
     """x intervals of side streets; none at the very ends."""
     found, x = [], start + rng.uniform(0.1, 1.0) * kind.crossing[1]
     while x < end - 20:
-        width = rng.uniform(5.5, 7.0) + 2 * PARALLEL * (rng.random() < kind.parking)
+        width = rng.uniform(5.5, 7.0) + 2 * PARALLEL_STRIP_M * (rng.random() < kind.parking)
         found.append((x, x + width))
         x += width + rng.uniform(*kind.crossing)
     return tuple(found)
 
 
-def _arm(front: str, x: float, land: int, curb: float, up: int, walk: float,
-         parking: float) -> Side:
+def _make_arm(front: str, x: float, land: int, curb: float, up: int, walk: float,
+              parking: float) -> Side:
     """The side of a side street at x, with its land towards land * x, that leaves the street from
     behind the houses at its curb towards up * y."""
     near = curb + up * (walk + 9.0)
-    return Side(x, near if up == -land else near + up * ARM, -land * np.pi / 2, ARM, CORNER,
-                str(front), parking)
+    return Side(x, near if up == -land else near + up * ARM_LENGTH_M, -land * np.pi / 2,
+                ARM_LENGTH_M, CORNER_WALK_M, str(front), parking)
 
 
-def parked_width(crossing: tuple[float, float]) -> float:
+def parking_width(crossing: tuple[float, float]) -> float:
     """The width of the parking strips on both sides of a side street."""
-    return PARALLEL if crossing[1] - crossing[0] > 8.0 else 0.0
+    return PARALLEL_STRIP_M if crossing[1] - crossing[0] > 8.0 else 0.0

@@ -15,15 +15,17 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from lidar_perception.simulation.hashing import uniform
+from lidar_perception.simulation.hashing import hash_uniform
 from lidar_perception.simulation.solids import RETROREFLECTOR
 
 ROAD, PARKING, SIDEWALK, GRASS = 40, 44, 48, 72  # SemanticKITTI
-GRAIN = 0.25  # m between the bumps of a rough surface
+GRAIN_M = 0.25  # m between the bumps of a rough surface
 PATCH = 10    # bumps from one rough patch to the next
-BARE, RISE = 0.45, 3.0  # share of the ground between the patches, about; how steep their edges are
-EVEN, PAVED = 0.1, 0.06  # height of bumps there and on the road, of that of the patches
-TUFTS_HIDE, TUFT_STEPS = 6.0, 8  # m of a grazing ray in which tufts are looked for, and steps
+BARE_SHARE = 0.45         # approximate share of the ground between the patches
+PATCH_STEEPNESS = 3.0     # of the edges of patches
+BARE_HEIGHT_SHARE = 0.1   # height of bumps between the patches, as a share of that in patches
+ROAD_HEIGHT_SHARE = 0.06  # height of bumps on the road, in the same way
+MAX_TUFT_DISTANCE_M, TUFT_STEPS = 6.0, 8  # length of a grazing ray that is searched for tufts
 
 
 class Ground(NamedTuple):
@@ -62,13 +64,13 @@ class GroundHit(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def shine(reflectance, cosine):
+def compute_brightness(reflectance, cosine):
     """Brightness, much softer than Lambert's law: on KITTI's scans the road has the same intensity
     at 20 m, where the rays graze it, as at 6 m. A retroreflector is as bright from anywhere."""
     return reflectance * (1 - 0.25 * (1 - cosine) * (reflectance < RETROREFLECTOR))
 
 
-def compiled(ground: Ground) -> Ground:
+def to_compiled(ground: Ground) -> Ground:
     """The same for compiled code: numbers, and crossings as an array (C, 2)."""
     return Ground._make(np.array(value, np.float64).reshape(-1, 2) if name == "crossings"
                         else float(value) for name, value in ground._asdict().items())
@@ -77,7 +79,7 @@ def compiled(ground: Ground) -> Ground:
 def surface_height(ground: Ground, x, y) -> np.ndarray:
     """Height of what one stands on at x, y (arrays), without roughness: road, sidewalk, grass."""
     x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
-    return _heights(compiled(ground), x.ravel(), y.ravel()).reshape(x.shape)
+    return _heights(to_compiled(ground), x.ravel(), y.ravel()).reshape(x.shape)
 
 
 @njit(cache=True, nogil=True)
@@ -85,7 +87,7 @@ def _heights(ground, x, y):
     height = np.empty(len(x))
     for i in range(len(x)):
         height[i] = _relief(ground, x[i], y[i])[0]
-        if _raised(ground, x[i], y[i]):
+        if _is_raised(ground, x[i], y[i]):
             height[i] += ground.curb_height
     return height
 
@@ -97,9 +99,9 @@ def cast_ground(ground, start, way, max_range):
     nothing = GroundHit(np.inf, 0.0, 0.0, 0)
     if not way[2] - ground.slope_x * way[0] - ground.slope_y * way[1] < -1e-3:
         return nothing
-    t, edge = _meet(ground, start, way, 0.0, 0.0, max_range), 0.0
-    if ground.curb_height and not (t <= max_range and _on_road(ground, start, way, t)):
-        t, edge = _meet_raised(ground, start, way, t, max_range)
+    t, edge = _intersect_relief(ground, start, way, 0.0, 0.0, max_range), 0.0
+    if ground.curb_height and not (t <= max_range and _stays_on_road(ground, start, way, t)):
+        t, edge = _intersect_raised(ground, start, way, t, max_range)
     if not t <= max_range:
         return nothing
     cosine = edge  # that at a curb, where one is met
@@ -107,15 +109,15 @@ def cast_ground(ground, start, way, max_range):
         _, slope_x, slope_y = _relief(ground, start[0] + t * way[0], start[1] + t * way[1])
         cosine = min(max(slope_x * way[0] + slope_y * way[1] - way[2], 1e-3), 1.0)
         if ground.rough or ground.litter:
-            t = _meet_tufts(ground, start, way, t, cosine)
+            t = _intersect_tufts(ground, start, way, t, cosine)
     semantic, reflectance = _surface(ground, start[0] + t * way[0], start[1] + t * way[1])
     if edge:
         semantic, reflectance = SIDEWALK, ground.sidewalk
-    return GroundHit(t, shine(reflectance, cosine), cosine, semantic)
+    return GroundHit(t, compute_brightness(reflectance, cosine), cosine, semantic)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def not_before(ground, start, way):
+def min_ground_range(ground, start, way):
     """A range, as cheap as can be, before which the ray of cast_ground meets nothing; inf where it
     does not fall."""
     closing = ground.slope_x * way[0] + ground.slope_y * way[1] - way[2]
@@ -124,11 +126,11 @@ def not_before(ground, start, way):
     height = start[2] - ground.slope_x * start[0] - ground.slope_y * start[1] - abs(ground.wave)
     height -= ground.curb_height + 0.01  # Newton's method stops within less of the relief
     tall = max(ground.rough, ground.litter)
-    return max((height - tall) / closing, height / closing - TUFTS_HIDE)
+    return max((height - tall) / closing, height / closing - MAX_TUFT_DISTANCE_M)
 
 
 @njit(cache=True, nogil=True)
-def _on_road(ground, start, way, t):
+def _stays_on_road(ground, start, way, t):
     """Whether a ray is between the curbs up to range t."""
     y, end = start[1], start[1] + t * way[1]
     return ground.curb_right < min(y, end) and max(y, end) < ground.curb_left
@@ -155,7 +157,7 @@ def _relief(ground, x, y):
 
 
 @njit(cache=True, nogil=True)
-def _crossed(ground, x):
+def _is_in_side_street(ground, x):
     """Whether x lies in a side street."""
     for i in range(len(ground.crossings)):
         if ground.crossings[i, 0] < x < ground.crossings[i, 1]:
@@ -164,13 +166,13 @@ def _crossed(ground, x):
 
 
 @njit(cache=True, nogil=True)
-def _raised(ground, x, y):
+def _is_raised(ground, x, y):
     """Whether x, y lie beyond the curbs and in no side street."""
-    return (y <= ground.curb_right or y >= ground.curb_left) and not _crossed(ground, x)
+    return (y <= ground.curb_right or y >= ground.curb_left) and not _is_in_side_street(ground, x)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _meet(ground, start, way, lift, t, max_range):
+def _intersect_relief(ground, start, way, lift, t, max_range):
     """Range of the relief raised by lift, searched from t by Newton's method; inf if none."""
     for _ in range(10):
         height, slope_x, slope_y = _relief(ground, start[0] + t * way[0], start[1] + t * way[1])
@@ -183,11 +185,11 @@ def _meet(ground, start, way, lift, t, max_range):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _meet_raised(ground, start, way, low, max_range):
+def _intersect_raised(ground, start, way, low, max_range):
     """Range with the curbs, given that of the relief, and the cosine where a curb is met, else
     0."""
-    high = _meet(ground, start, way, ground.curb_height, min(low, max_range), max_range)
-    if high < np.inf and _raised(ground, start[0] + high * way[0], start[1] + high * way[1]):
+    high = _intersect_relief(ground, start, way, ground.curb_height, min(low, max_range), max_range)
+    if high < np.inf and _is_raised(ground, start[0] + high * way[0], start[1] + high * way[1]):
         return high, 0.0
     t, edge = low, 0.0
     for i in range(2 + 2 * len(ground.crossings)):
@@ -197,16 +199,16 @@ def _meet_raised(ground, start, way, low, max_range):
         at = (line - start[axis]) / way[axis]
         if high < at < t:
             beyond = at + 1e-4  # a hair
-            if _raised(ground, start[0] + beyond * way[0], start[1] + beyond * way[1]):
+            if _is_raised(ground, start[0] + beyond * way[0], start[1] + beyond * way[1]):
                 t, edge = at, abs(way[axis])
     return t, edge
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _meet_tufts(ground, start, way, t, cosine):
+def _intersect_tufts(ground, start, way, t, cosine):
     """Range of the first tuft or bump met before the ground at t, else t: looked for where a ray is
     low enough, from the sensor on, in TUFT_STEPS steps; 0 where it starts in one."""
-    step = min(max(ground.rough, ground.litter) / cosine, TUFTS_HIDE) / TUFT_STEPS
+    step = min(max(ground.rough, ground.litter) / cosine, MAX_TUFT_DISTANCE_M) / TUFT_STEPS
     end, begin = start[1] + t * way[1], start[1] + (t - TUFT_STEPS * step) * way[1]
     left, right = ground.curb_left - ground.parking, ground.curb_right + ground.parking
     first = TUFT_STEPS - 1
@@ -216,8 +218,8 @@ def _meet_tufts(ground, start, way, t, cosine):
         back = k * step
         if back >= t:
             continue  # behind the sensor
-        top = tufts(ground, start[0] + (t - back) * way[0], start[1] + (t - back) * way[1],
-                    back * cosine)
+        top = tuft_height(ground, start[0] + (t - back) * way[0], start[1] + (t - back) * way[1],
+                          back * cosine)
         above = top / cosine  # the ray is as high so far before t
         if above > back:
             return max(t - min(above, back + step), 0.0)
@@ -225,22 +227,23 @@ def _meet_tufts(ground, start, way, t, cosine):
 
 
 @njit(cache=True, nogil=True)
-def tufts(ground, x, y, least):
+def tuft_height(ground, x, y, least):
     """Height of what grows and lies at x, y, in patches with nearly bare ground between; 0 where it
     is surely not above least."""
-    patch = min(max((_bumps(x / PATCH, y / PATCH) - BARE) * RISE, EVEN), 1.0)
+    patch = min(max((_bumps(x / PATCH, y / PATCH) - BARE_SHARE) * PATCH_STEEPNESS,
+                    BARE_HEIGHT_SHARE), 1.0)
     if not patch * max(ground.rough, ground.litter) > least:
         return 0.0
     semantic, _ = _surface(ground, x, y)
     most = ground.rough if semantic == ROAD or semantic == GRASS else ground.litter
-    return (PAVED if semantic == ROAD else patch) * most * _bumps(x, y)
+    return (ROAD_HEIGHT_SHARE if semantic == ROAD else patch) * most * _bumps(x, y)
 
 
 @njit(cache=True, nogil=True)
 def _surface(ground, x, y):
     """Class and reflectance of the ground at x, y."""
     beyond = max(y - ground.curb_left, ground.curb_right - y)
-    if _crossed(ground, x):
+    if _is_in_side_street(ground, x):
         return ROAD, ground.road
     if beyond >= 0:
         return (SIDEWALK, ground.sidewalk) if beyond < ground.walk else (GRASS, ground.grass)
@@ -250,12 +253,13 @@ def _surface(ground, x, y):
 @njit(cache=True, nogil=True)
 def _bumps(x, y):
     """0 .. 1 at x, y: value noise, the same at a place for ever."""
-    x, y = x / GRAIN, y / GRAIN
+    x, y = x / GRAIN_M, y / GRAIN_M
     left, low = math.floor(x), math.floor(y)
     place = (np.int64(left) << 32) + np.int64(low)
     a, b = x - left, y - low
     a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
     far = np.int64(1) << 32
-    near = uniform(0, np.uint64(place)) * (1 - b) + uniform(0, np.uint64(place + 1)) * b
-    next = uniform(0, np.uint64(place + far)) * (1 - b) + uniform(0, np.uint64(place + far + 1)) * b
+    near = hash_uniform(0, np.uint64(place)) * (1 - b) + hash_uniform(0, np.uint64(place + 1)) * b
+    next = (hash_uniform(0, np.uint64(place + far)) * (1 - b)
+            + hash_uniform(0, np.uint64(place + far + 1)) * b)
     return near * (1 - a) + next * a

@@ -6,20 +6,26 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lidar_perception.simulation.actors import SIGHT, Actor, Room
-from lidar_perception.simulation.crowd import standing, walking
-from lidar_perception.simulation.places import Side, scattered
-from lidar_perception.simulation.shapes.cyclists import cyclist, parked_bicycle, parked_motorcycle
-from lidar_perception.simulation.shapes.furniture import bench
-from lidar_perception.simulation.shapes.heavy_vehicles import bus, tram, truck
-from lidar_perception.simulation.shapes.people import sitting
-from lidar_perception.simulation.shapes.thing import Thing, block, disc, rigid
-from lidar_perception.simulation.shapes.vehicles import car, van
+from lidar_perception.simulation.actors import SIGHT_M, Actor, Room
+from lidar_perception.simulation.crowd import place_standing, place_walking
+from lidar_perception.simulation.places import Side, scatter
+from lidar_perception.simulation.shapes.cyclists import make_bicycle, make_cyclist, make_motorcycle
+from lidar_perception.simulation.shapes.furniture import make_bench
+from lidar_perception.simulation.shapes.heavy_vehicles import make_bus, make_tram, make_truck
+from lidar_perception.simulation.shapes.people import make_sitting_person
+from lidar_perception.simulation.shapes.thing import Thing, block, disc, make_rigid
+from lidar_perception.simulation.shapes.vehicles import make_car, make_van
 from lidar_perception.simulation.solids import parts
-from lidar_perception.simulation.street import CORNER, PARALLEL, Lane, Street, parked_width
+from lidar_perception.simulation.street import (
+    CORNER_WALK_M,
+    PARALLEL_STRIP_M,
+    Lane,
+    Street,
+    parking_width,
+)
 
-DRAWBAR = 0.8  # between a car and what it pulls, m
-FREE = 5.0     # nobody parks so near to a crossing, m
+DRAWBAR_M = 0.8  # between a car and what it pulls, m
+FREE_CORNER_M = 5.0     # nobody parks so near to a crossing, m
 OTHER_VEHICLE = 20  # of SemanticKITTI
 
 
@@ -27,61 +33,61 @@ def populate(rng: np.random.Generator, street: Street, room: Room, people: float
     """Everybody who has a label, and bicycles and motorcycles that nobody rides."""
     kind, blocks = street.kind, street.blocks
     for lane in street.lanes:
-        for group in _queue(rng, lane, street, room.seconds):
+        for group in _queue_vehicles(rng, lane, street, room.seconds):
             room.admit(*group, gap=0.3)
     for crossing in street.ground.crossings:
-        for actor in _side_street(rng, crossing, street.ground):
+        for actor in _fill_side_street(rng, crossing, street.ground):
             room.admit(actor, gap=0.3)
     for side, share in [(b, 1.0) for b in blocks] + [(arm, 0.7) for arm in street.arms]:
-        for actor in _parked(rng, side, share * rng.uniform(*kind.taken)):
+        for actor in _park_vehicles(rng, side, share * rng.uniform(*kind.taken)):
             room.admit(actor)
     for side in blocks:
-        for seat, *sitters in _seats(rng, side, kind.seats, people):
+        for seat, *sitters in _place_seats(rng, side, kind.seats, people):
             if room.admit(seat, gap=0.4):
                 room.add(*sitters)
-    for actor in _riders(rng, street, room.seconds, people):
+    for actor in _place_riders(rng, street, room.seconds, people):
         room.admit(actor, gap=0.3)
     for side in blocks:
-        for group in standing(rng, side, kind.standers * people):
+        for group in place_standing(rng, side, kind.standers * people):
             room.admit(*group)
-    for side in (*blocks, *_crosswalks(street)):
-        for group in walking(rng, side, kind.walkers * people, roam=kind.curb < 0.05):
+    for side in (*blocks, *_find_crosswalks(street)):
+        for group in place_walking(rng, side, kind.walkers * people, roam=kind.curb < 0.05):
             room.admit(*group)
 
 
-def _vehicles(rng, use: str) -> list[Thing]:
+def _draw_vehicles(rng, use: str) -> list[Thing]:
     """What comes along a lane, the first ahead of what it pulls; shares set by trial, so that
     the labels of many scenes come near KITTI's."""
     if use == "rail":
-        return [tram(rng)]
+        return [make_tram(rng)]
     pick = rng.random()
     if pick < 0.97:
-        return [(car if pick < 0.82 else van if pick < 0.91 else truck)(rng)]
-    return [bus(rng)] if pick < 0.985 else [car(rng), trailer(rng)]
+        return [(make_car if pick < 0.82 else make_van if pick < 0.91 else make_truck)(rng)]
+    return [make_bus(rng)] if pick < 0.985 else [make_car(rng), make_trailer(rng)]
 
 
-def trailer(rng) -> Thing:
+def make_trailer(rng) -> Thing:
     """A trailer with a closed load behind a car, on one axle."""
     length, width, height = size = tuple(rng.uniform((1.8, 1.3, 0.9), (3.8, 1.9, 2.3)).tolist())
     x, y = length / 2, width / 2
-    return rigid(parts([block((-x, -y, 0.35), (x, y, height), reflectance=rng.uniform(0.1, 0.5)),
-                        *(disc((0, s * (y - 0.1), 0.3), 0.3, 0.1, reflectance=0.06)
-                          for s in (-1, 1))], OTHER_VEHICLE), size, "Misc")
+    rows = [block((-x, -y, 0.35), (x, y, height), reflectance=rng.uniform(0.1, 0.5)),
+            *(disc((0, s * (y - 0.1), 0.3), 0.3, 0.1, reflectance=0.06) for s in (-1, 1))]
+    return make_rigid(parts(rows, OTHER_VEHICLE), size, "Misc")
 
 
-def _queue(rng, lane: Lane, street: Street, seconds: float) -> Iterator[list[Actor]]:
+def _queue_vehicles(rng, lane: Lane, street: Street, seconds: float) -> Iterator[list[Actor]]:
     """The vehicles of a lane that are ever in sight; nobody tailgates the ego vehicle."""
     if lane.use == "cycle":
         return
     ours, way = lane is street.lanes[0], lane.direction
     past = (street.speed - way * lane.speed) * seconds  # how far we get ahead of the lane
-    x, last = sorted((-way * SIGHT, way * SIGHT))
+    x, last = sorted((-way * SIGHT_M, way * SIGHT_M))
     x, last = x + min(past, 0.0), last + max(past, 0.0)
     stop_lines = [25.0] if ours else [edge[way < 0] for edge in street.ground.crossings]
     waiting = rng.uniform(0, 40)
     while True:
-        group = _vehicles(rng, lane.use)
-        length = sum(t.size[0] for t in group) + DRAWBAR * (len(group) - 1)
+        group = _draw_vehicles(rng, lane.use)
+        length = sum(t.size[0] for t in group) + DRAWBAR_M * (len(group) - 1)
         least = 1.2 + lane.speed
         x += least + rng.exponential(street.kind.headway * lane.speed + 1.0) * (
             2.0 if lane.use == "rail" else 1.0)
@@ -100,47 +106,48 @@ def _queue(rng, lane: Lane, street: Street, seconds: float) -> Iterator[list[Act
         for thing in group:
             middle = front - way * thing.size[0] / 2
             actors.append(Actor(thing, middle, lane.y + aside, head, speed))
-            front = middle - way * (thing.size[0] / 2 + DRAWBAR)
+            front = middle - way * (thing.size[0] / 2 + DRAWBAR_M)
         yield actors
 
 
-def _side_street(rng, crossing: tuple[float, float], ground) -> Iterator[Actor]:
+def _fill_side_street(rng, crossing: tuple[float, float], ground) -> Iterator[Actor]:
     """Cars that wait for us, drive away or pass our street."""
     low, high = crossing
-    strip = parked_width(crossing)
+    strip = parking_width(crossing)
     quarter = (high - low - 2 * strip) / 4 + strip
     for curb, up in ((ground.curb_left, 1), (ground.curb_right, -1)):
         coming, going = (low, high) if up > 0 else (high, low)
         coming, going = coming + up * quarter, going - up * quarter
         y = curb + up * rng.uniform(0.5, 1.0 + ground.walk)
         while rng.random() < 0.5:
-            thing = _vehicles(rng, "road")[0]
+            thing = _draw_vehicles(rng, "road")[0]
             yield Actor(thing, coming, y + up * thing.size[0] / 2, -up * np.pi / 2)
             y += up * (thing.size[0] + rng.uniform(1, 3))
         for chance, far in ((0.25, rng.uniform(5, 50)), (0.3, -rng.uniform(15, 100))):
             if rng.random() < chance:
-                yield Actor(_vehicles(rng, "road")[0], going, curb + up * far, up * np.pi / 2,
+                yield Actor(_draw_vehicles(rng, "road")[0], going, curb + up * far, up * np.pi / 2,
                             rng.uniform(3, 9))
 
 
-def _parked(rng, side: Side, taken: float) -> Iterator[Actor]:
+def _park_vehicles(rng, side: Side, taken: float) -> Iterator[Actor]:
     """Rows along the curb, cars in drives, and now and then a car park behind the sidewalk."""
     def vehicle():
         pick = rng.random()
         if pick < 0.965:
-            return (car if pick < 0.88 else van)(rng, driver=False)
-        return (truck if pick < 0.99 else trailer)(rng)
+            return (make_car if pick < 0.88 else make_van)(rng, driver=False)
+        return (make_truck if pick < 0.99 else make_trailer)(rng)
 
     def across(out, angle):
-        for along in np.arange(FREE, side.length - FREE, 2.6 / abs(np.sin(angle))):
+        spacing = 2.6 / abs(np.sin(angle))
+        for along in np.arange(FREE_CORNER_M, side.length - FREE_CORNER_M, spacing):
             if rng.random() < taken:
                 turn = angle + np.pi * (rng.random() < 0.3) + rng.normal(0, 0.03)
-                yield side.put(car(rng, driver=False), along, out + rng.normal(0, 0.15), turn)
+                yield side.put(make_car(rng, driver=False), along, out + rng.normal(0, 0.15), turn)
 
-    if side.parking > PARALLEL:
+    if side.parking > PARALLEL_STRIP_M:
         yield from across(-side.parking / 2 - 0.1, rng.choice([1.57, 2.2]))
-    along = FREE
-    while side.parking == PARALLEL and along < side.length - FREE - 4:
+    along = FREE_CORNER_M
+    while side.parking == PARALLEL_STRIP_M and along < side.length - FREE_CORNER_M - 4:
         thing = vehicle()
         if rng.random() < taken:
             turn = np.pi * (rng.random() < 0.95) + rng.normal(0, 0.025)
@@ -148,28 +155,28 @@ def _parked(rng, side: Side, taken: float) -> Iterator[Actor]:
                            -0.25 - thing.size[1] / 2 + rng.normal(0, 0.06), turn)
         along += thing.size[0] + rng.uniform(0.7, 1.8)
     if side.front == "garden":
-        for along in scattered(rng, side.length, 6.0):
-            yield side.put(car(rng, driver=False), along, side.walk + rng.uniform(3, 6),
+        for along in scatter(rng, side.length, 6.0):
+            yield side.put(make_car(rng, driver=False), along, side.walk + rng.uniform(3, 6),
                            rng.choice([-1, 1]) * np.pi / 2 + rng.normal(0, 0.04))
     if side.front == "verge" and rng.random() < 0.35:
         yield from across(side.walk + rng.uniform(5, 9), 1.57)
 
 
-def _seats(rng, side: Side, rate: float, people: float) -> Iterator[list[Actor]]:
+def _place_seats(rng, side: Side, rate: float, people: float) -> Iterator[list[Actor]]:
     """A bench with its back to the wall, and who sits there; chairs of cafes."""
-    for along in scattered(rng, side.length, 8 * rate):
+    for along in scatter(rng, side.length, 8 * rate):
         out, turn = max(side.walk - 0.7, 1.5), -np.pi / 2
-        sitters = [side.put(sitting(rng, chair=False), along + aside, out, turn)
+        sitters = [side.put(make_sitting_person(rng, chair=False), along + aside, out, turn)
                    for aside in (-0.45, 0.45) if rng.random() < min(0.2 * people, 0.8)]
-        yield [side.put(bench(rng), along, out, turn), *sitters]
-    for along in scattered(rng, side.length, rate * people):
+        yield [side.put(make_bench(rng), along, out, turn), *sitters]
+    for along in scatter(rng, side.length, rate * people):
         out = side.walk - rng.uniform(0.8, 2.5)
         for aside in rng.uniform((-0.9, 0.5), (-0.5, 0.9)):
-            yield [side.put(sitting(rng), along + aside, out,
+            yield [side.put(make_sitting_person(rng), along + aside, out,
                             np.pi * (aside > 0) + rng.normal(0, 0.2))]
 
 
-def _riders(rng, street: Street, seconds: float, people: float) -> Iterator[Actor]:
+def _place_riders(rng, street: Street, seconds: float, people: float) -> Iterator[Actor]:
     """Cyclists at the edges of the road, on the sidewalks and across; parked two-wheelers."""
     ground, kind = street.ground, street.kind
     lanes = [lane for lane in street.lanes if lane.use == "cycle"]
@@ -179,24 +186,24 @@ def _riders(rng, street: Street, seconds: float, people: float) -> Iterator[Acto
     for y, way in places:
         speed = rng.uniform(3.5, 5.5)
         first = street.start - (street.speed * seconds if way > 0 else 0.0)
-        for x in first + scattered(rng, street.end - first, kind.riders * people
-                                   * (2.0 if lanes else 1.0)):
-            yield Actor(cyclist(rng), x, y + rng.normal(0, 0.1), np.pi * (way < 0),
+        for x in first + scatter(rng, street.end - first, kind.riders * people
+                                 * (2.0 if lanes else 1.0)):
+            yield Actor(make_cyclist(rng), x, y + rng.normal(0, 0.1), np.pi * (way < 0),
                         speed * rng.uniform(0.95, 1.05))
-    for side in (*street.blocks, *_crosswalks(street)):
-        for along in scattered(rng, side.length, kind.riders * people * 0.5):
-            yield side.put(cyclist(rng), along, max(side.walk, 1.0) * rng.uniform(0.5, 0.7),
+    for side in (*street.blocks, *_find_crosswalks(street)):
+        for along in scatter(rng, side.length, kind.riders * people * 0.5):
+            yield side.put(make_cyclist(rng), along, max(side.walk, 1.0) * rng.uniform(0.5, 0.7),
                            np.pi * rng.integers(2), speed=rng.uniform(2.0, 4.5))
     for side in street.blocks:
-        for along in scattered(rng, side.length, kind.clutter / 6 if side.walk else 0.0):
+        for along in scatter(rng, side.length, kind.clutter / 6 if side.walk else 0.0):
             out, turn = rng.choice([0.9, max(side.walk - 1.0, 0.9)]), rng.normal(np.pi / 2, 0.2)
-            made = parked_bicycle if rng.random() < 0.75 else parked_motorcycle
+            made = make_bicycle if rng.random() < 0.75 else make_motorcycle
             for i in range(rng.integers(1, 6)):
                 yield side.put(made(rng), along + 0.75 * i, out, turn)
 
 
-def _crosswalks(street: Street) -> list[Side]:
+def _find_crosswalks(street: Street) -> list[Side]:
     """The sidewalks of the side streets, and on across our street."""
     far = 40.0
-    return [Side(x, land * far, -land * np.pi / 2, 2 * far, CORNER, "")
+    return [Side(x, land * far, -land * np.pi / 2, 2 * far, CORNER_WALK_M, "")
             for crossing in street.ground.crossings for x, land in zip(crossing, (-1, 1))]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from lidar_perception.simulation.sensor import STILL, Motion, Sensor
+from lidar_perception.simulation.sensor import NO_MOTION, Motion, Sensor
 from lidar_perception.simulation.solids import BOX, ELLIPSOID, Solids
 
 
@@ -42,8 +42,8 @@ class Grid(NamedTuple):
     fall: np.ndarray
 
 
-def windows(solids: Solids, sensor: Sensor, motion: Motion = STILL,
-            margin: float = 0.0) -> Windows:
+def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION,
+                 margin: float = 0.0) -> Windows:
     """The windows of solids in the frame at the stamp; margin, radians: of rays that differ so
     much from the sensor's. Beams that start over each other are taken as they are."""
     relative = solids.velocity - np.asarray(motion.velocity, np.float64)
@@ -61,22 +61,22 @@ def windows(solids: Solids, sensor: Sensor, motion: Motion = STILL,
                     np.empty((count, sensor.rings), bool), np.empty(count))
     shapes = (np.array(part, float, order="C")
               for part in (solids.centre, solids.half, solids.axes, relative))
-    _windows(found, grid, np.array(solids.kind), *shapes)
+    _fill_windows(found, grid, np.array(solids.kind), *shapes)
     return found
 
 
 @njit(cache=True, nogil=True)
-def _windows(found, grid, kind, centre, half, axes, relative):
+def _fill_windows(found, grid, kind, centre, half, axes, relative):
     corners, facing, reach = np.empty((16, 3)), np.empty((3, 3)), np.empty(3)
     for p in range(len(kind)):
         # From the time of the whole turn a window; from it the time for which the sensor looks
         # there.
         begin, end = (grid.begin, grid.end) if grid.moves else (0.0, 0.0)
         for _ in range(3 if grid.moves else 1):
-            ahead = _bearing(centre[p], relative[p], (begin + end) / 2)
-            _hull(corners, facing, reach, kind[p], centre[p], half[p], axes[p], relative[p], ahead,
-                  begin, end)
-            first, count = _columns(corners, grid, begin, end)
+            ahead = _find_direction(centre[p], relative[p], (begin + end) / 2)
+            _fill_corners(corners, facing, reach, kind[p], centre[p], half[p], axes[p],
+                          relative[p], ahead, begin, end)
+            first, count = _find_columns(corners, grid, begin, end)
             latest = grid.columns // 2 - first
             earliest = latest - count + 1
             begin, end = grid.begin, grid.end
@@ -85,11 +85,11 @@ def _windows(found, grid, kind, centre, half, axes, relative):
                 begin = earliest % grid.columns / turn - grid.stamp / grid.rate
                 end = latest % grid.columns / turn - grid.stamp / grid.rate
         found.first[p], found.count[p] = first % grid.columns, count
-        found.near[p] = _beams(corners, facing, ahead, grid, found.beams[p]) - 1e-6
+        found.near[p] = _fill_beams(corners, facing, ahead, grid, found.beams[p]) - 1e-6
 
 
 @njit(cache=True, nogil=True)
-def _bearing(centre, relative, since):
+def _find_direction(centre, relative, since):
     """The level direction to a solid."""
     x, y = centre[0] + relative[0] * since, centre[1] + relative[1] * since
     far = max(math.hypot(x, y), 1e-9)
@@ -97,7 +97,7 @@ def _bearing(centre, relative, since):
 
 
 @njit(cache=True, nogil=True)
-def _hull(corners, facing, reach, kind, centre, half, axes, relative, ahead, begin, end):
+def _fill_corners(corners, facing, reach, kind, centre, half, axes, relative, ahead, begin, end):
     """Fills corners (16, 3) around a solid from begin to end, s, and the axes of the box that they
     are: its own of a box; around what is round one that faces the sensor is tighter."""
     if kind == BOX:
@@ -125,7 +125,7 @@ def _hull(corners, facing, reach, kind, centre, half, axes, relative, ahead, beg
 
 
 @njit(cache=True, nogil=True)
-def _columns(corners, grid, begin, end):
+def _find_columns(corners, grid, begin, end):
     """First column and how many, of a sensor that turns meanwhile."""
     x, y = 0.0, 0.0
     for n in range(16):
@@ -147,7 +147,7 @@ def _columns(corners, grid, begin, end):
 
 
 @njit(cache=True, nogil=True)
-def _beams(corners, facing, ahead, grid, beams):
+def _fill_beams(corners, facing, ahead, grid, beams):
     """Fills which beams (rings,) reach the height of the hull; how near that comes to the z
     axis."""
     near, far, bottom, top = 0.0, 0.0, np.inf, -np.inf

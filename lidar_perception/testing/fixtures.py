@@ -87,9 +87,9 @@ def make_bag(tmp_path_factory) -> Callable[..., Path]:
 @pytest.fixture(scope="session")
 def drive_bag(make_bag) -> Path:
     """A simulated drive among people: eight clouds of 64 beams, with labels and a camera."""
-    from lidar_perception.simulation.scene import CROWDED
-    from lidar_perception.simulation.to_bag import simulated_scans
-    return make_bag(simulated_scans(33, FRAMES, scenes=CROWDED))
+    from lidar_perception.simulation.recording import simulate_frames
+    from lidar_perception.simulation.scene import CROWDED_ZONES
+    return make_bag(simulate_frames(33, FRAMES, scenes=CROWDED_ZONES))
 
 
 @pytest.hookimpl(wrapper=True)

@@ -28,7 +28,7 @@ from lidar_perception.runs.processes import run_in_processes
 from lidar_perception.runs.terminal import errors, show_progress
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.simulation.scene import Scenes
-from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.training.curves import fit_curves
 from lidar_perception.training.params import FusedTraining
 from lidar_perception.training.scenes import SimulatedScenes
@@ -119,7 +119,7 @@ def fit_fusion(weights: Path | None, classifier: Path | None, out: Path, params:
     detector = load_fused_detector("", "cpu", FusedDetectorParams(fused=own))
     header, other = detector.proposer.header, detector.classifier.header
     params = fill_from_header(params, header)
-    sensor = sensor_named(params.sensor, params.mount_height or _find_trained_height(header))
+    sensor = find_sensor(params.sensor, params.mount_height or _find_trained_height(header))
     scenes = Scenes(None, params.people, params.scene)
     scenes.sorts()  # raises InputError for an unknown one
     around = detector.range == "around"

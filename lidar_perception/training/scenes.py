@@ -17,13 +17,13 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording, split_topic
 from lidar_perception.simulation.camera import (
     FORWARD_CAMERA,
-    kitti_labels,
-    labels_around,
-    turned_camera,
-    worth_a_label,
+    find_labelled,
+    make_kitti_labels,
+    select_labels,
+    turn_camera,
 )
-from lidar_perception.simulation.drive import longest_drive, scan_at
-from lidar_perception.simulation.scene import ANY, Scenes
+from lidar_perception.simulation.drive import longest_drive, simulate_scan
+from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.cache import cache_path, file_fingerprint, folder_size, load_or_make
@@ -111,7 +111,7 @@ class SimulatedScenes:
     first: int
     count: int
     sensor: Sensor = HDL64E
-    scenes: Scenes = ANY
+    scenes: Scenes = ALL_STREETS
     cache: Path | None = None
     cache_gb: float = 20.0
     per_scene: int = 1
@@ -136,7 +136,7 @@ class SimulatedScenes:
     def scene(self, i: int) -> TrainingScene:
         """Return scene i to train on, with labels all around."""
         frame, truth = self.scan(i)
-        return TrainingScene(frame.points(), truth.boxes, truth.class_ids, worth_a_label(truth),
+        return TrainingScene(frame.points(), truth.boxes, truth.class_ids, find_labelled(truth),
                              True, self.sensor.height)
 
     def frame(self, i: int) -> Frame:
@@ -148,11 +148,11 @@ class SimulatedScenes:
         scan, truth = self.scan(i)
         scene, part = self.locate(i)
         if not self.scenes.camera:
-            return Frame.of(f"scene {scene} frame {part}", scan, labels_around(truth),
+            return Frame.of(f"scene {scene} frame {part}", scan, select_labels(truth),
                             sensor_height=self.sensor.height)
-        camera = turned_camera(np.pi / 2 * (i % 4)) if self.around else FORWARD_CAMERA
-        return Frame.of(f"street {scene} frame {part}", scan, kitti_labels(truth, camera), camera,
-                        sensor_height=self.sensor.height)
+        camera = turn_camera(np.pi / 2 * (i % 4)) if self.around else FORWARD_CAMERA
+        return Frame.of(f"street {scene} frame {part}", scan, make_kitti_labels(truth, camera),
+                        camera, sensor_height=self.sensor.height)
 
     def scan(self, i: int) -> tuple[PointCloud, GroundTruth]:
         """Return scan i with all its objects, from the cache if possible."""
@@ -165,7 +165,7 @@ class SimulatedScenes:
             self.scan(i)
 
     def _simulate(self, i: int) -> tuple[PointCloud, GroundTruth]:
-        scan = scan_at(*self.locate(i), self.sensor, self.scenes)
+        scan = simulate_scan(*self.locate(i), self.sensor, self.scenes)
         return scan.frame, scan.truth
 
 

@@ -17,7 +17,7 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.runs.files import make_folder
 from lidar_perception.runs.resuming import hash_names
 from lidar_perception.runs.terminal import errors
-from lidar_perception.simulation.sensor import Sensor, sensor_named
+from lidar_perception.simulation.sensor import Sensor, find_sensor
 from lidar_perception.training.cache import fill_cache
 from lidar_perception.training.data import Batches
 from lidar_perception.training.distributed import (
@@ -80,7 +80,7 @@ def start_training(trainer: Trainer, request: TrainingRequest, params: Any,
         params = with_values(params, {"data.cache": str(request.out / SCANS)})
     steps_given = bool(params.steps or params.epochs)
     hours = request.budget if steps_given else request.budget or DEFAULT_BUDGET_H
-    sensor = sensor_named(params.sensor, params.mount_height)
+    sensor = find_sensor(params.sensor, params.mount_height)
     settings = _collect_settings(request, params, sensor, init)
     with join_process_group(chosen_device(request.device)) as device, directory.lock():
         wait_for_all()  # until every process has looked at the files that rank 0 writes

@@ -27,7 +27,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING
 from lidar_perception.geometry import points_in_box
-from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import HDL64E
 
 ADAPTIVE = (PointNetConfig().clustering, EXPERT_CLUSTERING, BEST.clustering)
@@ -35,7 +35,7 @@ ADAPTIVE = (PointNetConfig().clustering, EXPERT_CLUSTERING, BEST.clustering)
 
 @pytest.fixture(scope="module")
 def scan():
-    return scan_at(4, 0, HDL64E)
+    return simulate_scan(4, 0, HDL64E)
 
 
 def make_scan(elevation_step, azimuth_step, rng):

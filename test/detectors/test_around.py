@@ -22,7 +22,7 @@ from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
 from lidar_perception.geometry import horizontal_range
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.scoring.centres.matching import match_centres
-from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import InputError, PointCloud
 
@@ -42,7 +42,7 @@ def columns_of(scan):
 
 @pytest.fixture(scope="module")
 def street(streets):
-    return scan_at(12, 0, HDL64E)
+    return simulate_scan(12, 0, HDL64E)
 
 
 @pytest.mark.parametrize("version", ["v0", "v4"])

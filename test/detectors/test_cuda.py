@@ -8,7 +8,7 @@ import torch
 
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
-from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import Detections
 
@@ -20,7 +20,7 @@ SURE = 0.3  # a score from which on a detection is in both
 
 @pytest.fixture(scope="module")
 def scan(streets):
-    return scan_at(12, 0, HDL64E).frame
+    return simulate_scan(12, 0, HDL64E).frame
 
 
 def assert_alike(a: Detections, b: Detections, metres: float = 0.05, score: float = 0.03) -> None:

@@ -15,7 +15,7 @@ from lidar_perception.detectors.pointnet.weights_file import judge_file
 from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.matching import match_centres
-from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import CLASSES
 
@@ -43,7 +43,7 @@ def test_each_says_what_it_was_trained_on_and_how_it_scores(file):
 
 @pytest.fixture(scope="module")
 def scans(streets):
-    return [scan_at(street, 0, HDL64E) for street in (0, 12, 15)]
+    return [simulate_scan(street, 0, HDL64E) for street in (0, 12, 15)]
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)

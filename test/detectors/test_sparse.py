@@ -25,7 +25,7 @@ from lidar_perception.detectors.pointpillars.pillars import make_pillars
 from lidar_perception.detectors.pointpillars.sparse_layers import dilated, shrunk
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.param_fields import with_values
-from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import InputError
 
@@ -226,7 +226,7 @@ def assert_same_detections(detectors, frames):
 @pytest.mark.parametrize("range", ["ahead", "around"])
 def test_detections_of_a_simulated_street_equal_torch(range, both_engines, streets):
     detectors = [detector.with_range(range) for detector in both_engines]
-    assert assert_same_detections(detectors, [scan_at(12, 0, HDL64E).frame]) > 5
+    assert assert_same_detections(detectors, [simulate_scan(12, 0, HDL64E).frame]) > 5
 
 
 def test_detections_of_kitti_frames_equal_torch(data, both_engines):

@@ -23,8 +23,8 @@ from lidar_perception.labels.drive_labels import DriveLabels, read_frame_labels
 from lidar_perception.labels.exchange import export_labels
 from lidar_perception.labels.formats import bag as bag_format
 from lidar_perception.robot.poses import invert_pose, transform_boxes
-from lidar_perception.simulation.sensor import generic
-from lidar_perception.simulation.to_bag import simulated_scans
+from lidar_perception.simulation.recording import simulate_frames
+from lidar_perception.simulation.sensor import make_generic_sensor
 from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.types import SENSOR_HEIGHT, Detections, GroundTruth, InputError, PointCloud
 from lidar_perception.wire.codec import bag_message
@@ -36,7 +36,7 @@ from msg_utils.markers import to_marker_array
 from msg_utils.stamps import make_header
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
-SMALL = generic(32, -25.0, 5.0, 0.4, 10.0)
+SMALL = make_generic_sensor(32, -25.0, 5.0, 0.4, 10.0)
 LAYOUTS = ("kitti", "kitti-tracking", "semantickitti")
 REAL = {"kitti_object": "kitti", "kitti_tracking": "kitti-tracking",
         "semantickitti": "semantickitti"}
@@ -93,7 +93,7 @@ def test_real_data_set_survives_conversion(folder, tmp_path):
 def simulated(streets, tmp_path_factory):
     """Return the bag of a simulated drive."""
     path = tmp_path_factory.mktemp("bags") / "drive"
-    write_bag(path, simulated_scans(5, 4, SMALL))
+    write_bag(path, simulate_frames(5, 4, SMALL))
     return path
 
 

@@ -20,8 +20,8 @@ import launch_testing
 import launch_testing.asserts
 
 from lidar_perception.nodes.graph import STAGES, list_result_topics
-from lidar_perception.simulation.scene import CROWDED
-from lidar_perception.simulation.to_bag import simulated_scans
+from lidar_perception.simulation.recording import simulate_frames
+from lidar_perception.simulation.scene import CROWDED_ZONES
 from lidar_perception.testing.bags import write_rosbags_bag
 from lidar_perception.testing.detections import to_objects
 from lidar_perception.testing.launching import include_launch_file, make_description
@@ -33,7 +33,7 @@ FRAMES = 6
 
 @pytest.mark.launch_test
 def generate_test_description():
-    bag = write_rosbags_bag(FOLDER / "drive", simulated_scans(33, FRAMES, scenes=CROWDED))
+    bag = write_rosbags_bag(FOLDER / "drive", simulate_frames(33, FRAMES, scenes=CROWDED_ZONES))
     return make_description(include_launch_file("replay", bag=bag, scores=FOLDER / "scores.json",
                                                 loop=True))
 

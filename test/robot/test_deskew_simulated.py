@@ -6,13 +6,13 @@ import numpy as np
 
 from lidar_perception.robot.deskew import deskew
 from lidar_perception.robot.poses import interpolate_poses
-from lidar_perception.simulation.raycast import cast
-from lidar_perception.simulation.returns import returns_of
-from lidar_perception.simulation.sensor import Motion, generic
+from lidar_perception.simulation.raycast import cast_rays
+from lidar_perception.simulation.returns import make_returns
+from lidar_perception.simulation.sensor import Motion, make_generic_sensor
 from lidar_perception.simulation.solids import BOX, CYLINDER, Solids
 from lidar_perception.simulation.terrain import Ground
 
-SENSOR = generic(24, -15.0, 10.0, 0.25, 10.0)
+SENSOR = make_generic_sensor(24, -15.0, 10.0, 0.25, 10.0)
 MOTION = Motion((15.0, 0.5, 0.0), 0.6, stamp=0.0)  # stamped at the start of the sweep
 
 
@@ -33,8 +33,8 @@ def make_objects(count=24):
 def test_deskewed_points_are_where_they_were_measured():
     """Odometry at 20 Hz, of a car at 15 m/s in a curve of 25 m radius."""
     pole, solids = make_objects()
-    hits = cast(solids, Ground(), np.array([0.0, 0.0, 1.73]), SENSOR, MOTION)
-    true, reported = (returns_of(hits, SENSOR, MOTION, np.random.default_rng(0), compensated)
+    hits = cast_rays(solids, Ground(), np.array([0.0, 0.0, 1.73]), SENSOR, MOTION)
+    true, reported = (make_returns(hits, SENSOR, MOTION, np.random.default_rng(0), compensated)
                       for compensated in (True, False))
     times = np.arange(-2, 4) * (10**9 // 20)
     seconds = times * 1e-9

@@ -17,7 +17,7 @@ from lidar_perception.sensor_setup.report.files import format_params, format_sen
 from lidar_perception.sensor_setup.report.params import choose_params
 from lidar_perception.sensor_setup.report.values import list_values
 from lidar_perception.sensor_setup.report.warnings import find_warnings
-from lidar_perception.simulation.sensor import NAMES, sensor_from_file, sensor_named
+from lidar_perception.simulation.sensor import SENSOR_NAMES, find_sensor, load_sensor
 from lidar_perception.wire.params import InputParams
 
 CHECKED = ("hdl-64e", "vlp-16", "pandarxt-32")  # by order, by rings, and by elevations
@@ -35,7 +35,7 @@ def measure(name):
 
 @pytest.mark.parametrize("name", CHECKED)
 def test_tilted_sensor_is_measured_correctly(name):
-    m, sensor = measure(name), sensor_named(name)
+    m, sensor = measure(name), find_sensor(name)
     driver, roll, pitch, height = MOUNTS[name]
     pattern, mount = m.pattern, m.mounting.mount
     assert len(pattern.beams.elevations) == sensor.rings and pattern.model == name
@@ -64,7 +64,7 @@ def test_sensor_file_is_the_measured_sensor(tmp_path):
     for name in CHECKED:
         path = tmp_path / f"{name}.yaml"
         path.write_text(format_sensor(measure(name)))
-        sensor, known = sensor_from_file(path), sensor_named(name)
+        sensor, known = load_sensor(path), find_sensor(name)
         assert sensor.columns == known.columns and sensor.divergence == pytest.approx(
             known.divergence, abs=1e-6)
         assert np.allclose(sensor.elevations, known.elevations, atol=np.radians(0.05))
@@ -95,13 +95,13 @@ def test_partly_seen_model_gets_all_its_beams(tmp_path):
     (tmp_path / "sensor.yaml").write_text(format_sensor(m))
     assert len(m.pattern.beams.elevations) == 14
     assert "14 of the 16 beams" in " ".join(find_warnings(m))
-    assert sensor_from_file(tmp_path / "sensor.yaml").elevations == pytest.approx(
-        sensor_named("vlp-16").elevations)
+    assert load_sensor(tmp_path / "sensor.yaml").elevations == pytest.approx(
+        find_sensor("vlp-16").elevations)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SENSOR_NAMES)
 def test_model_is_recognised_by_its_beams(name):
-    sensor = sensor_named(name)
+    sensor = find_sensor(name)
     up = np.degrees(sensor.elevations)
     beams = Beams(up, 0 * up, 0 * up, 0 * up, [], "ring")
     number = np.arange(len(up))
@@ -176,7 +176,7 @@ def test_real_sensors_are_recognised(data, folder, model, height, rings):
     scans = [read_scan(clouds.load(i)) for i in numbers]
     m = measure_sensor(scans, numbers, folder, clouds.count, None)
     assert m.pattern.model == model and rings - 2 <= len(m.pattern.beams.elevations) <= rings
-    step = np.degrees(sensor_named(model).azimuth_step)
+    step = np.degrees(find_sensor(model).azimuth_step)
     assert m.pattern.azimuth_step == pytest.approx(step, rel=0.05)
     if height is None:  # indoors, on a table
         assert m.mounting.mount is None and any("no ground" in line for line in find_warnings(m))

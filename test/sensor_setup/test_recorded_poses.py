@@ -24,9 +24,9 @@ from lidar_perception.sensor_setup.report.page import format_page
 from lidar_perception.sensor_setup.report.params import choose_node_params
 from lidar_perception.sensor_setup.report.values import list_values
 from lidar_perception.sensor_setup.report.warnings import find_warnings
+from lidar_perception.simulation.recording import simulate_frames
 from lidar_perception.simulation.scene import Scenes
-from lidar_perception.simulation.sensor import sensor_named
-from lidar_perception.simulation.to_bag import simulated_scans
+from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.wire.topics import ODOMETRY, TF_STATIC
 from lidar_perception.wire.transforms import TF_MESSAGE
 
@@ -36,7 +36,7 @@ COUNT, HEIGHT = 8, 1.7
 @cache
 def drive():
     """Return scans and poses of a sensor that drives ahead at a car's speed."""
-    frames = list(simulated_scans(502, COUNT, sensor_named("vlp-16"), 40, Scenes(scene="street")))
+    frames = list(simulate_frames(502, COUNT, find_sensor("vlp-16"), 40, Scenes(scene="street")))
     return [read_scan(_to_message(frame)) for frame in frames], [frame.pose() for frame in frames]
 
 

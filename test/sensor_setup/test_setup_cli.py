@@ -13,7 +13,7 @@ from lidar_perception.cli.options import read_config
 from lidar_perception.cli.setup import FILES
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.param_fields import with_values
-from lidar_perception.simulation.sensor import sensor_from_file
+from lidar_perception.simulation.sensor import load_sensor
 from lidar_perception.types import InputError
 
 
@@ -46,7 +46,7 @@ def robot(bag, tmp_path_factory):
 
 def test_every_file_is_written_and_readable(robot):
     assert sorted(p.name for p in robot.iterdir()) == sorted(FILES)
-    assert sensor_from_file(robot / "sensor.yaml").rings == 16
+    assert load_sensor(robot / "sensor.yaml").rings == 16
     params = with_values(PipelineParams(), read_config(robot / "robot.param.yaml",
                                                        PipelineParams()))
     assert params.ground.sensor_pose.height == pytest.approx(0.6, abs=0.02)

@@ -24,9 +24,9 @@ from lidar_perception.sensor_setup.report.files import format_params
 from lidar_perception.sensor_setup.report.params import choose_node_params
 from lidar_perception.sensor_setup.report.values import list_values
 from lidar_perception.sensor_setup.report.warnings import find_warnings
+from lidar_perception.simulation.recording import simulate_frames
 from lidar_perception.simulation.scene import Scenes
-from lidar_perception.simulation.sensor import sensor_named
-from lidar_perception.simulation.to_bag import simulated_scans
+from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array, to_array
@@ -259,8 +259,8 @@ DRIVES = {"at a robot's speed": (501, "campus", 0.92, 14, (0, 180, -25)),
 @pytest.mark.parametrize("name", DRIVES)
 def test_heading_is_measured_at_any_speed(name):
     seed, scene, speed, count, angles = DRIVES[name]
-    sensor = replace(sensor_named("vlp-16"), height=0.6)
-    frames = list(simulated_scans(seed, count, sensor, 40, Scenes(scene=scene)))
+    sensor = replace(find_sensor("vlp-16"), height=0.6)
+    frames = list(simulate_frames(seed, count, sensor, 40, Scenes(scene=scene)))
     way = np.linalg.norm(frames[-1].pose()[:2, 3] - frames[0].pose()[:2, 3])
     assert way == pytest.approx(speed * (count - 1) / sensor.rate, abs=0.1)
     for degrees in angles:

@@ -12,7 +12,7 @@ from tilted_samples import MOUNTS, simulate_clouds
 
 from lidar_perception.sensor_setup.measurement.measure import measure_sensor
 from lidar_perception.sensor_setup.measurement.scans import read_scan
-from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.simulation.sensor import find_sensor
 
 SCANS = 6
 
@@ -20,7 +20,7 @@ SCANS = 6
 def row(name: str, even: bool) -> str:
     """Return one row of the table."""
     _, roll, pitch, height = MOUNTS[name]
-    sensor = sensor_named(name)
+    sensor = find_sensor(name)
     scans = [read_scan(msg) for msg in simulate_clouds(name, SCANS, even)]
     m = measure_sensor(scans, [0, 1, 10, 11, 20, 21], name, SCANS, None)
     true = np.degrees(sensor.elevations)

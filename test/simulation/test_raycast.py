@@ -7,10 +7,10 @@ import pytest
 from raycast_samples import FULL, OVER_ROAD, SENSOR, crowd, solids
 
 from lidar_perception.simulation import foliage
-from lidar_perception.simulation.hashing import uniform
-from lidar_perception.simulation.raycast import cast
-from lidar_perception.simulation.returns import returns_of
-from lidar_perception.simulation.sensor import STILL, Motion, generic, rays
+from lidar_perception.simulation.hashing import hash_uniform
+from lidar_perception.simulation.raycast import cast_rays
+from lidar_perception.simulation.returns import make_returns
+from lidar_perception.simulation.sensor import NO_MOTION, Motion, make_generic_sensor, make_rays
 from lidar_perception.simulation.solids import BOX, CYLINDER, ELLIPSOID
 from lidar_perception.simulation.terrain import Ground
 
@@ -21,9 +21,9 @@ NO_GROUND = np.array([0.0, 0.0, 1e4])
 DRIVE = Motion((12.0, -1.0, 0.2), 0.8, stamp=0.3)
 
 
-def reference(made, sensor, motion=STILL):
+def reference(made, sensor, motion=NO_MOTION):
     """Range, solid (columns, rings) and reached, one solid after the other against every ray."""
-    turn = rays(sensor, motion)
+    turn = make_rays(sensor, motion)
     nearest = np.full(turn.direction.shape[:2], np.inf)
     solid, reached = np.full(nearest.shape, -1), {}
     for i in range(len(made)):
@@ -56,12 +56,12 @@ def same(one, other):
     return all(np.array_equal(a, b) for a, b in zip(one, other))
 
 
-@pytest.mark.parametrize("motion", [STILL, DRIVE])
+@pytest.mark.parametrize("motion", [NO_MOTION, DRIVE])
 @pytest.mark.parametrize("seed", range(4))
 def test_all_kinds_are_met_as_by_a_slow_reference(seed, motion):
     made = crowd(seed)
     for sensor in (SENSOR, replace(SENSOR, lifts=(), elevations=tuple(np.linspace(1.4, -1.4, 9)))):
-        hits = cast(made, Ground(), NO_GROUND, sensor, motion)
+        hits = cast_rays(made, Ground(), NO_GROUND, sensor, motion)
         nearest, solid, reached = reference(made, sensor, motion)
         assert (nearest < np.inf).sum() > 50
         assert np.allclose(hits.range, nearest, rtol=1e-9)
@@ -78,15 +78,15 @@ def leafy(seed):
 
 
 def test_the_same_arguments_give_the_same_bytes_and_another_seed_others():
-    for seed, motion in ((0, STILL), (1, DRIVE)):
+    for seed, motion in ((0, NO_MOTION), (1, DRIVE)):
         scene = leafy(seed), FULL._replace(rough=0.05), OVER_ROAD, WIDE, motion
-        one = cast(*scene, seed)
-        assert same(one, cast(*scene, seed))
+        one = cast_rays(*scene, seed)
+        assert same(one, cast_rays(*scene, seed))
         for other in (9, -1, (1 << 90) + 5):
-            assert not np.array_equal(cast(*scene, other).range, one.range)
+            assert not np.array_equal(cast_rays(*scene, other).range, one.range)
 
 
-@pytest.mark.parametrize("motion", [STILL, DRIVE])
+@pytest.mark.parametrize("motion", [NO_MOTION, DRIVE])
 def test_what_is_cast_together_is_the_nearest_of_what_is_cast_alone(motion):
     """Neither the order in which solids are drawn nor what is skipped as hidden changes a byte:
     a heap of solids, most of them without an owner, that overlap and lie in high grass."""
@@ -98,12 +98,12 @@ def test_what_is_cast_together_is_the_nearest_of_what_is_cast_alone(motion):
                    density=np.where(rng.random(count) < 0.3, 1.0, np.inf),
                    owner=np.where(rng.random(count) < 0.7, 0, made.owner).astype(np.int32))
     ground = FULL._replace(rough=0.8, litter=0.6, camber=0.03, curb_left=3.0, curb_right=-2.0)
-    hits = cast(made, ground, OVER_ROAD, SENSOR, motion)
-    nearest = cast(made.take(np.arange(0)), ground, OVER_ROAD, SENSOR, motion)._asdict()
+    hits = cast_rays(made, ground, OVER_ROAD, SENSOR, motion)
+    nearest = cast_rays(made.take(np.arange(0)), ground, OVER_ROAD, SENSOR, motion)._asdict()
     for i in range(count):
         # The others are out of reach, so that solid i keeps its place among them.
         alone = replace(made, centre=np.where(np.arange(count)[:, None] == i, made.centre, 1e4))
-        met = cast(alone, Ground(), NO_GROUND, SENSOR, motion)
+        met = cast_rays(alone, Ground(), NO_GROUND, SENSOR, motion)
         nearer = met.range < nearest["range"]
         assert (met.solid[nearer] == i).all()
         for name in nearest.keys() - {"reached"}:
@@ -116,7 +116,8 @@ def test_what_is_cast_together_is_the_nearest_of_what_is_cast_alone(motion):
 def test_order_of_solids_does_not_matter():
     made = crowd(7)
     order = np.random.default_rng(0).permutation(len(made))
-    one, other = (cast(s, Ground(), NO_GROUND, SENSOR, DRIVE) for s in (made, made.take(order)))
+    one, other = (cast_rays(s, Ground(), NO_GROUND, SENSOR, DRIVE)
+                  for s in (made, made.take(order)))
     assert np.array_equal(one.range, other.range) and np.array_equal(one.reached, other.reached)
 
 
@@ -126,7 +127,7 @@ def test_turned_things_give_turned_hits():
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0],
                      [0, 0, 1]])
     turned = replace(made, centre=made.centre @ turn.T, axes=turn @ made.axes)
-    one, other = (cast(s, Ground(), NO_GROUND, SENSOR) for s in (made, turned))
+    one, other = (cast_rays(s, Ground(), NO_GROUND, SENSOR) for s in (made, turned))
     assert np.array_equal(np.roll(one.owner, shift, axis=0), other.owner)
     assert np.allclose(np.roll(one.range, shift, axis=0), other.range, rtol=1e-9)
 
@@ -134,44 +135,45 @@ def test_turned_things_give_turned_hits():
 def test_a_moving_solid_is_seen_where_it_is_when_the_ray_leaves():
     velocity = np.array([10.0, -15.0, 0.0])
     made = solids(BOX, (-9, 3, 0), (1, 2, 1), velocity=velocity)
-    hits, since = cast(made, Ground(), NO_GROUND, SENSOR), rays(SENSOR).since
+    hits, since = cast_rays(made, Ground(), NO_GROUND, SENSOR), make_rays(SENSOR).since
     seen = np.flatnonzero((hits.owner == 1).any(axis=1))
     assert len(seen) > 10
     for column in seen:
         there = replace(made, centre=made.centre + velocity * since[column],
                         velocity=np.zeros((1, 3)))
         assert np.allclose(hits.range[column],
-                           cast(there, Ground(), NO_GROUND, SENSOR).range[column])
+                           cast_rays(there, Ground(), NO_GROUND, SENSOR).range[column])
 
 
 def test_a_wall_is_flat_only_after_compensation():
     wall = solids(BOX, (10, 0, 0), (1, 40, 8))
     exact = replace(SENSOR, range_noise=0.0, dropout=0.0)
-    hits = cast(wall, Ground(), NO_GROUND, exact, DRIVE)
-    flat, raw = (returns_of(hits, exact, DRIVE, np.random.default_rng(0), compensated)
+    hits = cast_rays(wall, Ground(), NO_GROUND, exact, DRIVE)
+    flat, raw = (make_returns(hits, exact, DRIVE, np.random.default_rng(0), compensated)
                  for compensated in (True, False))
     assert len(flat.xyz) > 1000 and np.abs(flat.xyz[:, 0] - 9).max() < 1e-5
     assert np.ptp(raw.xyz[:, 0]) > 0.1
-    still = cast(wall, Ground(), NO_GROUND, exact)
-    assert np.ptp(returns_of(still, exact, STILL, np.random.default_rng(0), False).xyz[:, 0]) < 1e-5
+    still = cast_rays(wall, Ground(), NO_GROUND, exact)
+    returns = make_returns(still, exact, NO_MOTION, np.random.default_rng(0), False)
+    assert np.ptp(returns.xyz[:, 0]) < 1e-5
 
 
 @pytest.fixture
 def even_leaves(monkeypatch):
     """Leaves everywhere, not in clumps."""
-    monkeypatch.setattr(foliage, "FILLED", 1.0)
+    monkeypatch.setattr(foliage, "LEAF_SHARE", 1.0)
 
 
 def test_leaves_hang_in_clumps_that_do_not_change_along_a_drive():
     """Two casts with other random numbers meet leaves in the same cells only; a share of FILLED."""
-    fine = generic(64, -8.0, 8.0, 0.1, 10.0, divergence=0.0)
+    fine = make_generic_sensor(64, -8.0, 8.0, 0.1, 10.0, divergence=0.0)
     plant = solids(BOX, (12, 0, 0), (3, 3, 3), density=2.0)
     filled = []
     for seed in (1, 2):
-        hits = cast(plant, Ground(), NO_GROUND, fine, seed=seed)
+        hits = cast_rays(plant, Ground(), NO_GROUND, fine, seed=seed)
         met = np.isfinite(hits.range)
         xyz = fine.directions()[met] * hits.range[met][:, None] - [12, 0, 0]
-        filled.append({tuple(c) for c in np.floor(xyz / foliage.CLUMP).astype(int)})
+        filled.append({tuple(c) for c in np.floor(xyz / foliage.CELL_M).astype(int)})
         assert len(xyz) > 2000
     both = filled[0] & filled[1]
     assert len(both) > 0.6 * min(map(len, filled))
@@ -182,9 +184,9 @@ def test_leaves_hang_in_clumps_that_do_not_change_along_a_drive():
 
 @pytest.mark.parametrize("kind", [BOX, ELLIPSOID, CYLINDER])
 def test_foliage_stops_rays_after_its_mean_free_path(kind, even_leaves):
-    fine = generic(32, -8.0, 8.0, 0.2, 10.0, divergence=0.0)
-    thin, thick = (cast(solids(kind, (12, 0, 0), (3, 3, 3), density=density), Ground(), NO_GROUND,
-                        fine, seed=5) for density in (np.inf, 0.7))
+    fine = make_generic_sensor(32, -8.0, 8.0, 0.2, 10.0, divergence=0.0)
+    thin, thick = (cast_rays(solids(kind, (12, 0, 0), (3, 3, 3), density=density), Ground(),
+                             NO_GROUND, fine, seed=5) for density in (np.inf, 0.7))
     shell = np.isfinite(thin.range)
     path = thick.range[shell] - thin.range[shell]
     assert shell.sum() > 1000 and (path > 0).all()
@@ -197,8 +199,8 @@ def test_foliage_stops_rays_after_its_mean_free_path(kind, even_leaves):
 
 
 def test_from_within_foliage_stops_rays_and_what_is_opaque_does_not(even_leaves):
-    inside = [cast(solids(ELLIPSOID, (0.5, 0, 0), (4, 4, 4), density=density), Ground(), NO_GROUND,
-                   SENSOR).range for density in (np.inf, 1.0)]
+    inside = [cast_rays(solids(ELLIPSOID, (0.5, 0, 0), (4, 4, 4), density=density), Ground(),
+                        NO_GROUND, SENSOR).range for density in (np.inf, 1.0)]
     assert not np.isfinite(inside[0]).any()
     assert abs((inside[1] < 1).mean() - (1 - np.exp(-1))) < 0.03 and inside[1].min() > 0
 
@@ -207,8 +209,8 @@ def test_glass_lets_its_share_pass_to_what_is_behind():
     panes = solids([BOX, BOX], [(8, 0, 0), (12, 0, 0)], (0.01, 3, 2), [1, 2],
                    transmission=0.7)
     panes = replace(panes, transmission=np.array([0.7, 0.0]))
-    fine = generic(32, -5.0, 5.0, 0.1, 10.0, divergence=0.0)
-    hits = cast(panes, Ground(), NO_GROUND, fine)
+    fine = make_generic_sensor(32, -5.0, 5.0, 0.1, 10.0, divergence=0.0)
+    hits = cast_rays(panes, Ground(), NO_GROUND, fine)
     front = np.abs(fine.directions()[..., 1]) < 0.2
     front &= fine.directions()[..., 0] > 0
     share = (hits.owner[front] == 2).mean()
@@ -218,7 +220,7 @@ def test_glass_lets_its_share_pass_to_what_is_behind():
 
 def test_nearest_wins_and_occlusion_is_seen():
     both = solids([BOX, BOX], [(9, 0, 0), (5, 0, 0)], (0.5, 0.5, 1.0), [2, 1])
-    hits = cast(both, Ground(), OVER_ROAD, SENSOR)
+    hits = cast_rays(both, Ground(), OVER_ROAD, SENSOR)
     seen = np.bincount(hits.owner.ravel(), minlength=3)
     assert (hits.range[0][hits.owner[0] == 1] < 5.0).all()
     assert seen[1] == hits.reached[1] and seen[2] < 0.4 * hits.reached[2]
@@ -227,9 +229,9 @@ def test_nearest_wins_and_occlusion_is_seen():
 def test_beams_at_edges_return_from_between_or_from_one_side():
     near, far = (BOX, (5, 0, 0), (0.2, 1, 1)), (BOX, (5.7, 0, 0), (0.2, 9, 4))
     made = solids(*zip(near, far), [1, 2])
-    fine = generic(64, -10.0, 10.0, 0.2, 10.0, divergence=3e-3)
-    exact = cast(made, Ground(), NO_GROUND, replace(fine, divergence=0.0))
-    beams = cast(made, Ground(), NO_GROUND, fine)
+    fine = make_generic_sensor(64, -10.0, 10.0, 0.2, 10.0, divergence=3e-3)
+    exact = cast_rays(made, Ground(), NO_GROUND, replace(fine, divergence=0.0))
+    beams = cast_rays(made, Ground(), NO_GROUND, fine)
     mixed = beams.owner == 0
     mixed &= np.isfinite(beams.range)
     low, high = exact.range[exact.owner > 0].min(), exact.range[exact.owner > 0].max()
@@ -238,22 +240,22 @@ def test_beams_at_edges_return_from_between_or_from_one_side():
     assert 0.9 < unchanged[exact.owner > 0].mean() < 1
     x = (fine.directions() * np.where(np.isfinite(beams.range), beams.range, 0)[..., None])[..., 0]
     assert (np.abs(x[beams.owner == 1] - 4.8) < 0.01).all()  # an owner's points are on it
-    apart = cast(replace(made, centre=made.centre + [[0, 0, 0], [3, 0, 0]]), Ground(), NO_GROUND,
-                 fine)
+    apart = cast_rays(replace(made, centre=made.centre + [[0, 0, 0], [3, 0, 0]]), Ground(),
+                      NO_GROUND, fine)
     assert (apart.owner[np.isfinite(apart.range)] > 0).all()  # too far apart to mix
     assert np.array_equal(beams.reached, exact.reached)
 
 
 def test_a_beam_within_one_surface_is_a_ray():
     made = solids(BOX, (8, 0, 0), (1, 200, 200))
-    one, other = (cast(made, Ground(), NO_GROUND, s) for s in (SENSOR, WIDE))
+    one, other = (cast_rays(made, Ground(), NO_GROUND, s) for s in (SENSOR, WIDE))
     inner = np.isfinite(np.roll(one.range, 1, 0)) & np.isfinite(np.roll(one.range, -1, 0))
     assert np.array_equal(one.range[inner], other.range[inner])
 
 
 def test_random_numbers_are_uniform_and_keep_their_place():
     def numbers(seed, count=40_000):
-        return np.array([uniform(seed, np.uint64((7 << 32) + i)) for i in range(count)])
+        return np.array([hash_uniform(seed, np.uint64((7 << 32) + i)) for i in range(count)])
 
     u = numbers(3)
     assert 0 < u.min() and u.max() < 1 and len(np.unique(u)) == len(u)

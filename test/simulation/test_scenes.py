@@ -15,22 +15,22 @@ from lidar_perception.data.semantickitti import MOVING
 from lidar_perception.data.to_bag import to_point_array
 from lidar_perception.sensor_setup.measurement.mount import measure_mount
 from lidar_perception.sensor_setup.measurement.scans import read_scan
-from lidar_perception.simulation.camera import worth_a_label
-from lidar_perception.simulation.drive import scan_at
-from lidar_perception.simulation.raycast import cast
-from lidar_perception.simulation.returns import returns_of
-from lidar_perception.simulation.scene import SCENES, Scenes, make_scene
-from lidar_perception.simulation.sensor import generic, sensor_named
+from lidar_perception.simulation.camera import find_labelled
+from lidar_perception.simulation.drive import simulate_scan
+from lidar_perception.simulation.raycast import cast_rays
+from lidar_perception.simulation.recording import simulate_frames
+from lidar_perception.simulation.returns import make_returns
+from lidar_perception.simulation.scene import SCENE_TYPES, Scenes, make_scene
+from lidar_perception.simulation.sensor import find_sensor, make_generic_sensor
 from lidar_perception.simulation.terrain import surface_height
-from lidar_perception.simulation.to_bag import simulated_scans
-from lidar_perception.simulation.way import ROBOT, Way, swaying
+from lidar_perception.simulation.trajectory import ROBOT_RADIUS_M, Trajectory, draw_trajectory
 from lidar_perception.training.scenes import SimulatedScenes
 from lidar_perception.types import CLASSES, InputError
 from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array
 
-ROBOTS = [(scene, kind) for scene in ("campus", "indoor") for kind in SCENES[scene].kinds]
-TINY = generic(16, -15.0, 15.0, 2.0, 10.0, height=0.6)
+ROBOTS = [(scene, kind) for scene in ("campus", "indoor") for kind in SCENE_TYPES[scene].kinds]
+TINY = make_generic_sensor(16, -15.0, 15.0, 2.0, 10.0, height=0.6)
 EXACT = replace(TINY, range_noise=0.0, dropout=0.0, divergence=0.0)
 PEOPLE = {CLASSES.index(name) for name in ("Pedestrian", "Person_sitting", "Cyclist")}
 SITTING, GROUND = CLASSES.index("Person_sitting"), (40, 44, 48, 72)
@@ -46,7 +46,7 @@ def moved(xyz, pose):
     (Scenes("zone", 3.0), 5, 60, 2543, 46185.171547, 659.233862469)])
 def test_a_seed_gives_the_street_that_it_always_gave(scenes, seed, moment, points, metres, labels):
     """Written down anew where simulated cars, say, are made otherwise on purpose."""
-    scan = scan_at(seed, moment, TINY, scenes)
+    scan = simulate_scan(seed, moment, TINY, scenes)
     assert len(scan.frame) == points
     assert np.abs(scan.frame.xyz, dtype=float).sum() == pytest.approx(metres, rel=1e-6)
     assert np.abs(scan.truth.boxes).sum() == pytest.approx(labels, rel=1e-9)
@@ -56,7 +56,7 @@ def test_a_way_is_smooth():
     """Its heading, velocity and yaw rate are the derivatives of where it is."""
     h = 1e-4
     for seed in range(20):
-        way = swaying(np.random.default_rng(seed), (0.5, 1.5), 0.2, 0.7)
+        way = draw_trajectory(np.random.default_rng(seed), (0.5, 1.5), 0.2, 0.7)
         for t in (0.0, 3.3, 19.0):
             before, now, after = (way.at(t + d) for d in (-h, 0.0, h))
             assert np.allclose(np.subtract(after[:2], before[:2]) / (2 * h), now.velocity,
@@ -66,7 +66,7 @@ def test_a_way_is_smooth():
             assert abs(now.heading) < 0.71 and np.hypot(*now.velocity) < 1.5 / np.cos(0.7)
             assert np.allclose(np.tan(now.heading) * now.velocity[0], now.velocity[1])
     assert way.sampled(20.0, 0.1).shape == (201, 3)
-    assert Way().at(7.0) == (0.0, 0.0, 0.0, (0.0, 0.0), 0.0)
+    assert Trajectory().at(7.0) == (0.0, 0.0, 0.0, (0.0, 0.0), 0.0)
 
 
 @pytest.mark.parametrize("scene, kind", ROBOTS)
@@ -76,7 +76,7 @@ def test_nobody_runs_into_the_robot_or_each_other(scene, kind):
     fixed = flat_boxes(np.array([a.footprint for a in props]), 0.0)
     for t in np.linspace(0.0, made.seconds, 9):
         moment, pose = made.at(t, 0.6), made.sensor_pose(t, 0.6)
-        robot = np.array([[0.0, 0, 0, 1.4 * ROBOT, 1.4 * ROBOT, 1, 0]])
+        robot = np.array([[0.0, 0, 0, 1.4 * ROBOT_RADIUS_M, 1.4 * ROBOT_RADIUS_M, 1, 0]])
         boxes = np.concatenate([robot, moment.boxes * [1, 1, 0, 1, 1, 1, 1]])
         assert not {0} & set(overlaps(boxes, 1)[:, 0].tolist())
         for i, j in overlaps(boxes, len(boxes)):
@@ -94,9 +94,9 @@ def test_points_and_boxes_are_where_they_are_in_the_world(scene, kind):
     made = replace(made, ground=made.ground._replace(rough=0.0, litter=0.0))
     for t in (0.0, 7.3):
         moment, pose = made.at(t, 0.6), made.sensor_pose(t, 0.6)
-        hits = cast(moment.solids, made.ground, moment.position, EXACT, moment.motion, 1,
-                    moment.heading)
-        got = returns_of(hits, EXACT, moment.motion, np.random.default_rng(0))
+        hits = cast_rays(moment.solids, made.ground, moment.position, EXACT, moment.motion, 1,
+                         moment.heading)
+        got = make_returns(hits, EXACT, moment.motion, np.random.default_rng(0))
         world = moved(got.xyz.astype(float), pose)
         ground = np.isin(got.semantic, GROUND) & (got.owner == 0)
         off = world[ground, 2] - surface_height(made.ground, *world[ground, :2].T)
@@ -118,23 +118,24 @@ def test_a_turned_sensor_sees_the_same():
     meet that look there, but for what glass lets through."""
     made, ranges, turn = scene_of("indoor", "store"), [], 20 * 2 * np.pi / EXACT.columns
     for aside in (0.0, np.tan(turn)):
-        one = replace(made, way=Way(1e-9, ((1e-9 * aside, 1.0, 0.0),)))
+        one = replace(made, way=Trajectory(1e-9, ((1e-9 * aside, 1.0, 0.0),)))
         moment = one.at(0.0, 0.6)
-        ranges.append(cast(moment.solids, one.ground, moment.position, EXACT,
-                           heading=moment.heading).range)
+        ranges.append(cast_rays(moment.solids, one.ground, moment.position, EXACT,
+                                heading=moment.heading).range)
     assert moment.heading == pytest.approx(turn)
     same = np.isclose(np.roll(ranges[0], -20, axis=0), ranges[1], atol=1e-6)
     assert same.mean() > 0.95
 
 
 def test_robots_have_labels_all_around_and_no_camera(tmp_path):
-    frames = list(simulated_scans(3, 2, TINY, 1, Scenes(None, 3.0, "campus")))
+    frames = list(simulate_frames(3, 2, TINY, 1, Scenes(None, 3.0, "campus")))
     for number, frame in enumerate(frames):
-        truth, whole = frame.truth(), scan_at(3 + number, 0, TINY, Scenes(None, 3.0, "campus"))
+        truth = frame.truth()
+        whole = simulate_scan(3 + number, 0, TINY, Scenes(None, 3.0, "campus"))
         assert frame.camera() is None and frame.sensor_height == 0.6
-        assert len(truth) == worth_a_label(whole.truth).sum()
+        assert len(truth) == find_labelled(whole.truth).sum()
     assert any((frame.truth().boxes[:, 0] < 0).any() for frame in frames)
-    assert next(simulated_scans(3, 1, TINY, 1)).camera() is not None
+    assert next(simulate_frames(3, 1, TINY, 1)).camera() is not None
 
 
 def test_a_mix_takes_turns_and_is_trained_on():
@@ -146,10 +147,11 @@ def test_a_mix_takes_turns_and_is_trained_on():
     assert source.scene(0).height == 0.6 and source.key(0) != SimulatedScenes(3, 2, TINY).key(0)
 
 
-@pytest.mark.parametrize("kind", SCENES["indoor"].kinds)
+@pytest.mark.parametrize("kind", SCENE_TYPES["indoor"].kinds)
 def test_setup_finds_the_height_indoors(kind):
-    sensor = replace(sensor_named("vlp-16", 0.6), azimuth_step=float(np.radians(0.8)))
-    frames = [scan_at(7, i, sensor, Scenes(kind, 1.0, "indoor")).frame for i in (0, 1, 90, 91)]
+    sensor = replace(find_sensor("vlp-16", 0.6), azimuth_step=float(np.radians(0.8)))
+    frames = [simulate_scan(7, i, sensor, Scenes(kind, 1.0, "indoor")).frame
+              for i in (0, 1, 90, 91)]
     clouds = [from_array(to_point_array(frame), header(bag_message, frame.stamp_ns), bag_message)
               for frame in frames]
     mount = measure_mount([read_scan(cloud) for cloud in clouds])
@@ -184,13 +186,13 @@ def test_the_command_writes_every_layout_of_a_robot(layout, tmp_path):
     (Scenes(people=1e25), "people = 1e.25 must be 0 .. 100")])
 def test_what_is_no_scene_is_named(scenes, said):
     with pytest.raises(InputError, match=said):
-        next(simulated_scans(0, 1, TINY, 1, scenes))
+        next(simulate_frames(0, 1, TINY, 1, scenes))
 
 
 def test_beams_that_wander_do_so_where_there_is_one_scan_of_each_scene():
     sensor, seen = replace(EXACT, wander=np.radians(2.0)), []
     for seed in range(3):
-        scan = scan_at(seed, 0, sensor, Scenes(scene="campus"))
+        scan = simulate_scan(seed, 0, sensor, Scenes(scene="campus"))
         lowest = scan.frame.xyz[scan.ring == sensor.rings - 1]
         seen.append(np.degrees(np.median(np.arctan2(lowest[:, 2], np.hypot(*lowest[:, :2].T)))))
     assert np.diff(np.sort(seen)).min() > 0.3 and np.ptp(seen) < 2.0

@@ -7,24 +7,24 @@ import numpy as np
 import pytest
 
 from lidar_perception.simulation.raycast import Hits
-from lidar_perception.simulation.returns import returns_of
+from lidar_perception.simulation.returns import make_returns
 from lidar_perception.simulation.sensor import (
     HDL64E,
-    NAMES,
-    STILL,
+    NO_MOTION,
+    SENSOR_NAMES,
     Motion,
     Sensor,
-    generic,
-    hdl64e,
-    rays,
-    sensor_from_file,
-    sensor_named,
+    find_sensor,
+    load_sensor,
+    make_generic_sensor,
+    make_hdl64e,
+    make_rays,
 )
 from lidar_perception.simulation.solids import RETROREFLECTOR
-from lidar_perception.simulation.terrain import shine
+from lidar_perception.simulation.terrain import compute_brightness
 from lidar_perception.types import InputError
 
-SMALL = generic(8, -10.0, 4.0, 0.5, 10.0)
+SMALL = make_generic_sensor(8, -10.0, 4.0, 0.5, 10.0)
 
 
 def hits(sensor, distance, brightness=0.3, cosine=1.0):
@@ -36,14 +36,14 @@ def hits(sensor, distance, brightness=0.3, cosine=1.0):
                 np.full(shape, 10, np.uint16), np.zeros(shape, np.int32), np.array([0, 1]))
 
 
-def measured(sensor, distance, brightness=0.3, motion=STILL, seed=0, cosine=1.0, **flags):
-    return returns_of(hits(sensor, distance, brightness, cosine), sensor, motion,
+def measured(sensor, distance, brightness=0.3, motion=NO_MOTION, seed=0, cosine=1.0, **flags):
+    return make_returns(hits(sensor, distance, brightness, cosine), sensor, motion,
                    np.random.default_rng(seed), **flags)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SENSOR_NAMES)
 def test_presets_are_sensible(name):
-    sensor = sensor_named(name)
+    sensor = find_sensor(name)
     direction = sensor.directions()
     assert direction.shape == (sensor.columns, sensor.rings, 3)
     assert np.allclose(np.linalg.norm(direction, axis=2), 1)
@@ -58,11 +58,11 @@ def test_presets_are_sensible(name):
 
 def test_kittis_sensor_is_kittis():
     assert (HDL64E.height, HDL64E.columns, HDL64E.rate) == (1.73, 2140, 10.0)
-    step = {rate: np.degrees(hdl64e(rate).azimuth_step) for rate in (5, 10, 20)}
+    step = {rate: np.degrees(make_hdl64e(rate).azimuth_step) for rate in (5, 10, 20)}
     assert step[5] < 0.085 and abs(step[10] - 0.168) < 1e-3 and abs(step[20] / step[10] - 2) < 1e-3
     for rate in (4.9, 20.1, -1, np.nan):
         with pytest.raises(InputError, match="rate"):
-            hdl64e(rate)
+            make_hdl64e(rate)
 
 
 @pytest.mark.parametrize("change, named", [
@@ -86,21 +86,21 @@ def test_impossible_sensors_are_refused(change, named):
 def test_impossible_generic_sensors_and_unknown_names_are_refused():
     for wrong in ((0, -10, 10), (16, 10, -10), (16, -95, 10)):
         with pytest.raises(InputError):
-            generic(*wrong, 0.2, 10.0)
+            make_generic_sensor(*wrong, 0.2, 10.0)
     with pytest.raises(InputError, match="hdl-64e"):
-        sensor_named("hdl128")
+        find_sensor("hdl128")
 
 
 def test_names_are_known_however_they_are_written():
-    assert sensor_named("os1_64") == sensor_named("OS1-64") != sensor_named("os1-128")
-    assert sensor_named("hdl64e") == sensor_named("HDL-64E") == HDL64E
+    assert find_sensor("os1_64") == find_sensor("OS1-64") != find_sensor("os1-128")
+    assert find_sensor("hdl64e") == find_sensor("HDL-64E") == HDL64E
 
 
 def test_a_file_in_degrees_is_the_sensor_in_radians(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("name: mine\nelevations: [4, 0, -10.5]\nazimuth_step: 0.5\nrate: 10\n"
                     "divergence: 0.2\nfade: [10, 0.1]\nblocked:\n- [1, 350, 10]\nwander: 2\n")
-    assert sensor_from_file(path) == sensor_named(str(path)) == Sensor(
+    assert load_sensor(path) == find_sensor(str(path)) == Sensor(
         tuple(np.radians([4.0, 0.0, -10.5])), np.radians(0.5), rate=10.0,
         divergence=np.radians(0.2), fade=(10.0, 0.1), blocked=((1, 350.0, 10.0),),
         wander=np.radians(2.0))
@@ -127,7 +127,7 @@ def test_a_file_of_no_possible_sensor_is_named_with_what_is_wrong(tmp_path, text
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=named) as error:
-        sensor_from_file(path)
+        load_sensor(path)
     assert str(path) in str(error.value) and "\n" not in str(error.value)
 
 
@@ -142,7 +142,7 @@ def test_beams_that_wander_fill_the_gaps_between_them_evenly():
 
 def test_rays_turn_and_move_with_the_sensor():
     motion = Motion((3.0, -2.0, 0.5), 0.7, stamp=0.25)
-    still, turn = rays(SMALL), rays(SMALL, motion)
+    still, turn = make_rays(SMALL), make_rays(SMALL, motion)
     assert np.allclose(turn.since, SMALL.times() - 0.025)
     assert np.allclose(turn.origin[:, 0], turn.since[:, None] * motion.velocity)
     bearing = np.arctan2(turn.direction[..., 1], turn.direction[..., 0])
@@ -183,7 +183,7 @@ def test_a_ring_keeps_its_elevation_and_time_its_bearing():
     rise = found.xyz[:, 2] / np.linalg.norm(found.xyz, axis=1)
     assert np.allclose(np.arcsin(rise), np.array(SMALL.elevations)[found.ring], atol=1e-5)
     column = np.round(np.arctan2(found.xyz[:, 1], found.xyz[:, 0]) / (2 * np.pi) * SMALL.columns)
-    assert np.allclose(found.time, rays(SMALL).since[column.astype(int) % SMALL.columns])
+    assert np.allclose(found.time, make_rays(SMALL).since[column.astype(int) % SMALL.columns])
 
 
 def test_noise_is_as_wide_as_told():
@@ -249,7 +249,8 @@ def test_retroreflectors_do_not_fade():
     sensor = replace(SMALL, fade=(10.0, 0.01))
     assert measured(sensor, 60.0, RETROREFLECTOR).intensity.mean() > 0.95
     assert measured(sensor, 60.0, 0.9).intensity.mean() < 0.45
-    assert shine(RETROREFLECTOR, 0.1) == RETROREFLECTOR > 1.2 * shine(0.99, 0.1)
+    assert compute_brightness(RETROREFLECTOR, 0.1) == RETROREFLECTOR
+    assert RETROREFLECTOR > 1.2 * compute_brightness(0.99, 0.1)
 
 
 def test_the_vehicle_blocks_its_sectors():
@@ -271,7 +272,8 @@ def test_a_sector_is_as_wide_as_told_and_may_be_the_whole_turn(start, end, degre
 
 
 def test_a_generic_sensor_can_be_named():
-    assert sensor_named("generic:32,-25,15,0.2,10") == generic(32, -25.0, 15.0, 0.2, 10.0)
+    expected = make_generic_sensor(32, -25.0, 15.0, 0.2, 10.0)
+    assert find_sensor("generic:32,-25,15,0.2,10") == expected
 
 
 @pytest.mark.parametrize("name", ["generic:", "generic:32", "generic:64,-24,2,1e-9,10",
@@ -283,5 +285,5 @@ def test_a_generic_sensor_can_be_named():
                                   "generic:0,-25,15,0.2,10", "generic:nan,-25,15,0.2,10"])
 def test_a_generic_sensor_that_cannot_be_is_refused_in_one_line(name):
     with pytest.raises(InputError) as error:
-        sensor_named(name)
+        find_sensor(name)
     assert "\n" not in str(error.value) and "must" in str(error.value)

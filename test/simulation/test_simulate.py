@@ -23,14 +23,14 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.runs import resumable_folder
 from lidar_perception.simulation import dataset
 from lidar_perception.simulation.dataset import LAYOUTS
-from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.types import InputError
 
 pytestmark = pytest.mark.usefixtures("streets", "tiny_sensor")
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = """
-from lidar_perception.simulation.sensor import SENSORS, generic
-SENSORS["tiny"] = generic(16, -14.0, 3.0, 2.0, 10.0)
+from lidar_perception.simulation.sensor import SENSORS, make_generic_sensor
+SENSORS["tiny"] = make_generic_sensor(16, -14.0, 3.0, 2.0, 10.0)
 from lidar_perception.cli.main import main
 main()
 """
@@ -57,10 +57,10 @@ def test_a_data_set_that_failed_in_the_middle_is_marked_and_resumed(made, tmp_pa
     def fails(*args):
         if next(calls) == 3:
             raise ZeroDivisionError
-        return scan_at(*args)
+        return simulate_scan(*args)
 
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
-        patch.setattr(dataset, "scan_at", fails)
+        patch.setattr(dataset, "simulate_scan", fails)
         run(out, layout, 5, 1, "--streets-of", 2)
     assert json.loads((out / "INCOMPLETE").read_text())["frames"] == 5
     assert not (out / "dataset.json").exists()
@@ -218,7 +218,7 @@ def test_a_set_is_not_resumed_with_another_sensor_of_the_same_name(tmp_path):
 def test_resume_names_every_difference(tmp_path, monkeypatch):
     out = tmp_path / "set"
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
-        patch.setattr(dataset, "scan_at", lambda *_: 1 / 0)
+        patch.setattr(dataset, "simulate_scan", lambda *_: 1 / 0)
         run(out)
     with pytest.raises(InputError, match=r"format 'kitti', not 'semantickitti'; streets_of 1") as e:
         run(out, "semantickitti", 5, 1, "--resume")

@@ -13,10 +13,10 @@ from lidar_perception.data.kitti.labels import read_object_labels, read_tracking
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.semantickitti import MOVING, THINGS
 from lidar_perception.geometry import box_corners, points_in_box, wrap_angle
-from lidar_perception.simulation.batch import training_scans
-from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
-from lidar_perception.simulation.drive import scan_at, scans
-from lidar_perception.simulation.scene import CROWDED
+from lidar_perception.simulation.batch import generate_training_scans
+from lidar_perception.simulation.camera import FORWARD_CAMERA, make_kitti_labels
+from lidar_perception.simulation.drive import simulate_drive, simulate_scan
+from lidar_perception.simulation.scene import CROWDED_ZONES
 from lidar_perception.simulation.sensor import SENSORS
 from lidar_perception.types import SENSOR_HEIGHT
 
@@ -25,9 +25,9 @@ pytestmark = [pytest.mark.no_cover,  # others run these lines
 
 
 def test_any_scan_of_a_drive_can_be_had_alone():
-    several = list(scans(3, 3, TINY))
+    several = list(simulate_drive(3, 3, TINY))
     for i, scan in enumerate(several):
-        alone = scan_at(3, i, TINY)
+        alone = simulate_scan(3, i, TINY)
         assert scan.frame.xyz.tobytes() == alone.frame.xyz.tobytes()
         assert np.array_equal(scan.semantic, alone.semantic)
         assert scan.truth.extras == alone.truth.extras
@@ -35,7 +35,7 @@ def test_any_scan_of_a_drive_can_be_had_alone():
 
 
 def test_columns_of_a_scan_fit_its_points():
-    scan = scan_at(3, 7, TINY)
+    scan = simulate_scan(3, 7, TINY)
     xyz, n = scan.frame.xyz.astype(float), len(scan.frame)
     assert {scan.semantic.dtype, scan.instance.dtype, scan.ring.dtype} == {np.dtype(np.uint16)}
     assert all(len(c) == n for c in (scan.semantic, scan.instance, scan.ring, scan.time))
@@ -59,7 +59,7 @@ def test_object_layout_reads_back(made):
     recording = open_recording(made / "kitti")
     assert len(recording) == 5
     for number, recorded in enumerate(recording):
-        scan = scan_at(3 + number // 2, number % 2, TINY)
+        scan = simulate_scan(3 + number // 2, number % 2, TINY)
         order = np.argsort(scan.ring, kind="stable")
         assert recorded.name == f"{number:06}"
         frame, camera = recorded.load(), recorded.camera()
@@ -67,13 +67,13 @@ def test_object_layout_reads_back(made):
         assert np.array_equal(frame.intensity, scan.frame.intensity[order])
         assert np.allclose(camera.projection, FORWARD_CAMERA.camera().projection)
         assert (camera.width, camera.height) == (1242, 375)
-        same_objects(recorded.truth(), kitti_labels(scan.truth), 0.0051)
+        same_objects(recorded.truth(), make_kitti_labels(scan.truth), 0.0051)
 
 
 def test_what_is_hidden_or_nearly_so_is_not_labelled_but_marked():
-    scan = scan_at(33, 0, SENSORS["hdl64e"], CROWDED)
+    scan = simulate_scan(33, 0, SENSORS["hdl64e"], CROWDED_ZONES)
     seen = write_kitti.keep_visible_objects(scan.truth, FORWARD_CAMERA)
-    labels = kitti_labels(scan.truth)
+    labels = make_kitti_labels(scan.truth)
     assert 0 < len(labels) < len(seen) == len(labels) + len(labels.notes)
     assert all(e["num_points"] >= 5 and e["visible"] >= 0.15 for e in labels.extras)
     kept = {e["track_id"] for e in labels.extras}
@@ -87,8 +87,8 @@ def test_tracking_layout_reads_back(made):
     assert [f.name for f in frames] == ["0000/000000", "0000/000001", "0001/000000", "0001/000001",
                                         "0002/000000"]
     for number, recorded in enumerate(open_recording(made / "kitti-tracking")):
-        scan = scan_at(3 + number // 2, number % 2, TINY)
-        expected = kitti_labels(scan.truth)
+        scan = simulate_scan(3 + number // 2, number % 2, TINY)
+        expected = make_kitti_labels(scan.truth)
         truth = recorded.truth()
         same_objects(truth, expected, 6e-7, truncation=0.26)
         assert ([e["track_id"] for e in truth.extras]
@@ -117,7 +117,7 @@ def test_semantickitti_layout_reads_back(made):
     assert [f.name for f in frames] == ["00/000000", "00/000001", "01/000000", "01/000001",
                                         "02/000000"]
     for number, frame in enumerate(frames):
-        scan = scan_at(3 + number // 2, number % 2, TINY)
+        scan = simulate_scan(3 + number // 2, number % 2, TINY)
         order = np.argsort(scan.ring, kind="stable")
         truth = frame.point_truth()
         assert np.array_equal(frame.load().xyz, scan.frame.xyz[order])
@@ -134,7 +134,7 @@ def test_semantickitti_layout_reads_back(made):
         assert np.loadtxt(folder / "times.txt").tolist() == [0.0, 0.1]
         for moment, pose in enumerate(poses):  # as SemanticKITTI's own tools do
             pose = np.linalg.inv(to_camera) @ np.vstack([pose, [0, 0, 0, 1]]) @ to_camera
-            assert np.allclose(pose, scan_at(3 + sequence, moment, TINY).pose, atol=1e-9)
+            assert np.allclose(pose, simulate_scan(3 + sequence, moment, TINY).pose, atol=1e-9)
 
 
 @pytest.mark.parametrize("layout, inner", [
@@ -158,7 +158,7 @@ def test_a_bag_goes_on_with_the_next_street(tmp_path):
     assert result.exit_code == 0, result.output
     recording = list(open_recording(tmp_path / "bag"))
     for number, recorded in enumerate(recording):
-        scan = scan_at(3 + number // 2, number % 2, TINY)
+        scan = simulate_scan(3 + number // 2, number % 2, TINY)
         assert np.array_equal(recorded.load().xyz, scan.frame.xyz)
     stamps = [r.load().stamp_ns for r in recording]
     assert np.diff(stamps).tolist() == [10**8, 101 * 10**8, 10**8]
@@ -204,7 +204,7 @@ def test_2d_boxes_are_those_of_real_labels(data):
 
 
 def test_labels_without_objects_read_back(tmp_path):
-    nothing = scan_at(3, 0, TINY).truth
+    nothing = simulate_scan(3, 0, TINY).truth
     nothing = type(nothing).of([], [])
     write_kitti.write_object(tmp_path, 0, np.zeros((0, 4)), nothing, FORWARD_CAMERA)
     assert len(read_object_labels(tmp_path / "training/label_2/000000.txt", np.eye(4))) == 0
@@ -214,8 +214,8 @@ def test_labels_without_objects_read_back(tmp_path):
 
 
 def test_training_scans_are_the_streets_in_order():
-    for street, batch in zip((3, 4, 5), training_scans(3, TINY)):
-        scan = scan_at(street, 0, TINY)
+    for street, batch in zip((3, 4, 5), generate_training_scans(3, TINY)):
+        scan = simulate_scan(street, 0, TINY)
         assert batch["points"].dtype == batch["boxes"].dtype == torch.float32
         assert np.array_equal(batch["points"][:, :3], scan.frame.xyz)
         assert np.array_equal(batch["points"][:, 3], scan.frame.intensity)
@@ -228,11 +228,11 @@ class Streets(torch.utils.data.IterableDataset):
     """What a user writes for a DataLoader."""
 
     def __iter__(self):
-        return itertools.islice(training_scans(3, TINY), 2)
+        return itertools.islice(generate_training_scans(3, TINY), 2)
 
 
 def test_workers_of_a_loader_share_the_streets():
     expected = sorted(batch["points"].numpy().tobytes()
-                      for batch in itertools.islice(training_scans(3, TINY), 4))
+                      for batch in itertools.islice(generate_training_scans(3, TINY), 4))
     loader = torch.utils.data.DataLoader(Streets(), batch_size=None, num_workers=2)
     assert sorted(batch["points"].numpy().tobytes() for batch in loader) == expected

@@ -7,11 +7,11 @@ import pytest
 
 from lidar_perception.geometry import box_corners, points_in_box
 from lidar_perception.simulation import drive as drives
-from lidar_perception.simulation.drive import scans, truth
-from lidar_perception.simulation.raycast import cast
-from lidar_perception.simulation.returns import returns_of
-from lidar_perception.simulation.scene import ANY, CROWDED
-from lidar_perception.simulation.sensor import HDL64E, STILL
+from lidar_perception.simulation.drive import label_scan, simulate_drive
+from lidar_perception.simulation.raycast import cast_rays
+from lidar_perception.simulation.returns import make_returns
+from lidar_perception.simulation.scene import ALL_STREETS, CROWDED_ZONES
+from lidar_perception.simulation.sensor import HDL64E, NO_MOTION
 from lidar_perception.simulation.terrain import surface_height
 from lidar_perception.types import CLASSES, PEDESTRIAN
 
@@ -21,35 +21,35 @@ pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("streets")]  # other
 
 
 def street(seed):
-    return drives._scene(seed, ANY)
+    return drives._make_cached_scene(seed, ALL_STREETS)
 
 
 def scan(seed, t, sensor=COARSE):
     """Hits, and the measured xyz and owner, of one moment of street(seed)."""
     scene = street(seed)
     moment = scene.at(t, sensor.height)
-    hits = cast(moment.solids, scene.ground, moment.position, sensor)
-    xyz, _, owner, *_ = returns_of(hits, sensor, STILL, np.random.default_rng(0))
+    hits = cast_rays(moment.solids, scene.ground, moment.position, sensor)
+    xyz, _, owner, *_ = make_returns(hits, sensor, NO_MOTION, np.random.default_rng(0))
     return scene, moment, hits, xyz, owner
 
 
 def test_same_seed_same_bytes():
     def content(seed):
         return [(s.frame.xyz.tobytes(), s.frame.intensity.tobytes(), s.frame.stamp_ns,
-                 s.truth.boxes.tobytes(), s.truth.extras) for s in scans(seed, 2, COARSE)]
+                 s.truth.boxes.tobytes(), s.truth.extras) for s in simulate_drive(seed, 2, COARSE)]
     first = content(0)
     assert first == content(0)
     assert all(a[0] != b[0] for a, b in zip(first, content(1)))
 
 
 def test_a_longer_drive_starts_like_a_shorter_one():
-    short, = scans(1, 1, COARSE)
-    long = next(scans(1, 9, COARSE))
+    short, = simulate_drive(1, 1, COARSE)
+    long = next(simulate_drive(1, 9, COARSE))
     assert np.array_equal(short.frame.xyz, long.frame.xyz)
 
 
 def test_frames_are_as_promised():
-    for i, scan in enumerate(scans(0, 3, COARSE)):
+    for i, scan in enumerate(simulate_drive(0, 3, COARSE)):
         frame, found = scan.frame, scan.truth
         assert frame.xyz.dtype == frame.intensity.dtype == np.float32
         assert frame.xyz.shape == (len(frame.intensity), 3) and frame.xyz.flags.c_contiguous
@@ -70,7 +70,7 @@ def test_frames_are_as_promised():
 @pytest.mark.parametrize("seed", [0, 2])
 def test_points_of_an_object_lie_in_its_box(seed, t):
     _, moment, hits, xyz, owner = scan(seed, t)
-    semantic = returns_of(hits, COARSE, STILL, np.random.default_rng(0)).semantic
+    semantic = make_returns(hits, COARSE, NO_MOTION, np.random.default_rng(0)).semantic
     for box, track, speed, kind in zip(moment.boxes, moment.track_ids, moment.speeds,
                                        moment.class_ids):
         own = (owner == track) & (semantic != 99)  # 99: what a person carries
@@ -82,7 +82,7 @@ def test_points_of_an_object_lie_in_its_box(seed, t):
         outside = ~points_in_box(xyz[own], box, margin=beam + 0.05)
         assert speed > 2 or outside.sum() <= 0.4 * own.sum()
     assert set(np.unique(owner)) <= {0, *moment.track_ids}
-    found = truth(moment, hits, owner)
+    found = label_scan(moment, hits, owner)
     assert [e["num_points"] for e in found.extras] == [
         (owner == e["track_id"]).sum() for e in found.extras]
 
@@ -103,7 +103,7 @@ def test_boxes_stand_on_the_ground_and_apart(seed):
 
 
 def test_pedestrians_walk_in_view_all_the_time():
-    for scan in scans(33, 11, replace(COARSE, rate=2.5), CROWDED):
+    for scan in simulate_drive(33, 11, replace(COARSE, rate=2.5), CROWDED_ZONES):
         boxes = scan.truth.of_class(PEDESTRIAN)
         reach, bearing = np.hypot(boxes[:, 0], boxes[:, 1]), np.arctan2(boxes[:, 1], boxes[:, 0])
         seen = (np.abs(bearing) < np.radians(40)) & (reach > 6) & (reach < 35)
@@ -116,9 +116,9 @@ def test_order_of_objects_does_not_matter():
     order = np.random.default_rng(0).permutation(len(scene.actors))
     shuffled = replace(scene, actors=tuple(scene.actors[i] for i in order))
     moments = [s.at(1.0, 1.73) for s in (scene, shuffled)]
-    first, second = (cast(replace(m.solids, density=np.full(len(m.solids), np.inf),
-                                  transmission=np.zeros(len(m.solids))),
-                          scene.ground, m.position, EXACT) for m in moments)
+    first, second = (cast_rays(replace(m.solids, density=np.full(len(m.solids), np.inf),
+                                       transmission=np.zeros(len(m.solids))),
+                               scene.ground, m.position, EXACT) for m in moments)
     assert np.array_equal(first.range, second.range)
     assert np.array_equal(first.semantic, second.semantic)
     assert len(moments[0].boxes) == len(moments[1].boxes)
@@ -129,7 +129,7 @@ def test_scans_look_like_those_of_the_real_sensor():
     about 27 000 over the square of its range."""
     density, labels = [], set()
     for seed in (0, 33):
-        scan = next(scans(seed, 1, scenes=CROWDED))
+        scan = next(simulate_drive(seed, 1, scenes=CROWDED_ZONES))
         frame, found = scan.frame, scan.truth
         assert 95_000 < len(frame) < 135_000
         assert 0.15 < frame.intensity.mean() < 0.4
@@ -146,5 +146,5 @@ def test_scans_look_like_those_of_the_real_sensor():
     ({"seed": -1}, "seed = -1")])
 def test_bad_input_is_named_at_the_call(arguments, named):
     with pytest.raises(ValueError, match=named) as error:
-        scans(**arguments)
+        simulate_drive(**arguments)
     assert "\n" not in str(error.value)

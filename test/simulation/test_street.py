@@ -7,17 +7,24 @@ import numpy as np
 import pytest
 
 from lidar_perception.geometry import box_corners
-from lidar_perception.simulation.actors import HEADING, LENGTH, SPEED, WIDTH, centres, meet
+from lidar_perception.simulation.actors import (
+    HEADING,
+    LENGTH,
+    SPEED,
+    WIDTH,
+    compute_centres,
+    footprints_touch,
+)
 from lidar_perception.simulation.roadside import is_plant
 from lidar_perception.simulation.scene import make_scene
-from lidar_perception.simulation.street import KINDS
+from lidar_perception.simulation.street import STREET_KINDS
 from lidar_perception.simulation.terrain import surface_height
 from lidar_perception.types import CLASSES, InputError
 
 pytestmark = pytest.mark.no_cover  # others run these lines
 
 SEEDS = range(3)
-EVERY = [(kind, seed) for kind in KINDS for seed in SEEDS]
+EVERY = [(kind, seed) for kind in STREET_KINDS for seed in SEEDS]
 SIGN = 81  # of SemanticKITTI
 TIMES = (0.0, 4.0, 8.0, 12.0, 16.0)
 HEIGHT = 1.73
@@ -28,7 +35,7 @@ scene_of = cache(lambda kind, seed, people=1.0: make_scene(seed, kind, people))
 
 def flat_boxes(footprints, t):
     """(M, 7) boxes [x y 0 l w 1 heading] in the world of footprints (M, 8) at time t."""
-    middle = centres(footprints, np.array([t]))[:, 0]
+    middle = compute_centres(footprints, np.array([t]))[:, 0]
     one, zero = np.ones(len(middle)), np.zeros(len(middle))
     return np.column_stack([middle, zero, 2 * footprints[:, LENGTH:WIDTH + 1], one,
                             footprints[:, HEADING]])
@@ -141,7 +148,7 @@ def test_nobody_tailgates_the_ego_vehicle(kind, seed):
 
 
 def test_solids_carry_the_velocity_and_the_class_of_their_owner():
-    for kind in KINDS:
+    for kind in STREET_KINDS:
         m = scene_of(kind, 0).at(3.0, HEIGHT)
         speed = dict(zip(m.track_ids, m.speeds))
         flat = np.hypot(*m.solids.velocity[:, :2].T)
@@ -170,9 +177,9 @@ def test_streets_hold_what_kitti_labels():
     have 1.7 cars, 0.19 pedestrians and 0.14 cyclists, fewer than stand there: what is hidden has
     no label. They are few (11 pedestrians, 8 cyclists), so the bands are wide."""
     seeds = range(4)  # cyclists are rare
-    share = np.array([k.share for k in KINDS.values()])
-    found = np.zeros((len(KINDS), len(CLASSES)))
-    for i, kind in enumerate(KINDS):
+    share = np.array([k.share for k in STREET_KINDS.values()])
+    found = np.zeros((len(STREET_KINDS), len(CLASSES)))
+    for i, kind in enumerate(STREET_KINDS):
         for seed in seeds:
             for t in TIMES:
                 m = scene_of(kind, seed).at(t, HEIGHT)
@@ -218,7 +225,7 @@ def test_meet_equals_many_looks_at_short_intervals():
     rows[::3, SPEED] = 0.0
     rows[1::3, 6:] = 0.0, np.inf
     one, many = rows[0] + [0, 0, 0, 0, 0, 1, 0, 0], rows[1:]
-    fast = np.array([meet(one, row, 5.0, 0.0) for row in many])
+    fast = np.array([footprints_touch(one, row, 5.0, 0.0) for row in many])
     slow = np.zeros(len(many), bool)
     for t in np.linspace(0.0, 5.0, 501):
         boxes = flat_boxes(rows, t)
@@ -226,4 +233,4 @@ def test_meet_equals_many_looks_at_short_intervals():
         slow[[j - 1 for i, j in overlaps(boxes, 1)]] = True
     assert 20 < fast.sum() < 100
     assert (fast >= slow).all() and (fast != slow).sum() <= 2  # touched for less than an interval
-    assert np.array_equal(fast, [meet(row, one, 5.0, 0.0) for row in many])
+    assert np.array_equal(fast, [footprints_touch(row, one, 5.0, 0.0) for row in many])

@@ -8,16 +8,22 @@ from numba import njit
 from raycast_samples import FULL, OVER_ROAD, SENSOR, crowd
 
 from experiments.realism.roughness import roughness
-from lidar_perception.simulation.raycast import cast
-from lidar_perception.simulation.sensor import HDL64E, rays
-from lidar_perception.simulation.terrain import Ground, cast_ground, compiled, surface_height, tufts
+from lidar_perception.simulation.raycast import cast_rays
+from lidar_perception.simulation.sensor import HDL64E, make_rays
+from lidar_perception.simulation.terrain import (
+    Ground,
+    cast_ground,
+    surface_height,
+    to_compiled,
+    tuft_height,
+)
 
 pytestmark = pytest.mark.no_cover  # others run these lines
 
 
 def test_flat_ground_is_at_height_over_sine():
     plain = replace(SENSOR, lifts=())
-    hits = cast(crowd(0, 0), Ground(), OVER_ROAD, plain)
+    hits = cast_rays(crowd(0, 0), Ground(), OVER_ROAD, plain)
     sine = -np.sin(np.array(plain.elevations))
     expected = np.where(sine > 0, plain.height / np.where(sine > 0, sine, 1), np.inf)
     expected[expected > plain.max_range] = np.inf
@@ -28,9 +34,9 @@ def test_flat_ground_is_at_height_over_sine():
 def on_ground(ground, position=(3.0, 0.4), sensor=None):
     sensor = sensor or replace(SENSOR, azimuth_step=np.radians(0.5))
     position = np.array([*position, surface_height(ground, *position) + sensor.height])
-    hits = cast(crowd(0, 0), ground, position, sensor)
+    hits = cast_rays(crowd(0, 0), ground, position, sensor)
     met = np.isfinite(hits.range)
-    turn = rays(sensor)
+    turn = make_rays(sensor)
     at = position + turn.origin + turn.direction * np.where(met, hits.range, 0.0)[..., None]
     return at[met], hits.semantic[met], met, hits
 
@@ -55,7 +61,7 @@ def test_the_ground_is_met_where_it_is(ground):
 def test_no_ray_passes_through_the_ground():
     _, _, met, hits = on_ground(FULL)
     sensor = replace(SENSOR, azimuth_step=np.radians(0.5))
-    turn, start = rays(sensor), np.array([3.0, 0.4, surface_height(FULL, 3.0, 0.4) + 1.7])
+    turn, start = make_rays(sensor), np.array([3.0, 0.4, surface_height(FULL, 3.0, 0.4) + 1.7])
     for share in np.linspace(0.02, 0.995, 40):
         way = turn.direction * (np.where(met, hits.range, 0.0) * share)[..., None]
         x, y, z = ((start + turn.origin + way)[met]).T
@@ -104,8 +110,8 @@ def test_grass_is_rough_at_every_range_and_hides_what_is_behind_it():
 def first_below_tufts(ground, start, way):
     """The first range, 5 mm by 5 mm, at which a ray is below the tufts."""
     t = 0.0
-    while t < 30.0 and start[2] + t * way[2] >= tufts(ground, start[0] + t * way[0],
-                                                      start[1] + t * way[1], 0.0):
+    while t < 30.0 and start[2] + t * way[2] >= tuft_height(ground, start[0] + t * way[0],
+                                                            start[1] + t * way[1], 0.0):
         t += 0.005
     return t
 
@@ -115,7 +121,7 @@ def test_tufts_are_met_where_a_slow_march_meets_them():
     meadow = Ground(curb_left=2.0, curb_right=-2.0, walk=0.0, rough=0.5)
     yaw, down = rng.uniform(0.3, 2.8, 400), rng.uniform(0.06, 0.3, 400)
     ways = np.stack([np.cos(yaw) * np.cos(down), np.sin(yaw) * np.cos(down), -np.sin(down)], 1)
-    ground, start = compiled(meadow), (0.0, 0.0, 1.7)
+    ground, start = to_compiled(meadow), (0.0, 0.0, 1.7)
     off = np.abs([cast_ground(ground, start, tuple(way), 60.0).range
                   - first_below_tufts(ground, start, tuple(way)) for way in ways.tolist()])
     # Steps are longer than tufts are thick: some are missed, and few met too early.
@@ -127,5 +133,5 @@ def test_nothing_is_met_behind_a_low_sensor(height, least):
     """Beside a meadow whose tufts are higher than it, and among the bumps of the road."""
     meadow = Ground(curb_left=1.0, curb_right=-1.0, walk=0.0, rough=0.8)
     low = replace(SENSOR, height=height, lifts=())
-    hits = cast(crowd(0, 0), meadow, np.array([0.0, 0.0, height]), low)
+    hits = cast_rays(crowd(0, 0), meadow, np.array([0.0, 0.0, height]), low)
     assert np.isfinite(hits.range).any() and hits.range.min() > least

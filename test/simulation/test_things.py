@@ -5,9 +5,9 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from lidar_perception.simulation.raycast import cast
-from lidar_perception.simulation.returns import returns_of
-from lidar_perception.simulation.sensor import HDL64E, STILL
+from lidar_perception.simulation.raycast import cast_rays
+from lidar_perception.simulation.returns import make_returns
+from lidar_perception.simulation.sensor import HDL64E, NO_MOTION
 from lidar_perception.simulation.shapes import (
     buildings,
     cyclists,
@@ -19,7 +19,7 @@ from lidar_perception.simulation.shapes import (
 )
 from lidar_perception.simulation.shapes.thing import SIZES, block, disc, draw_size, rod
 from lidar_perception.simulation.shapes.vehicles import SIDE
-from lidar_perception.simulation.solids import extents, parts, place
+from lidar_perception.simulation.solids import compute_extents, parts, place_parts
 from lidar_perception.simulation.terrain import Ground
 from lidar_perception.types import CLASSES
 
@@ -27,23 +27,25 @@ pytestmark = pytest.mark.no_cover  # others run these lines
 
 SEEDS = range(12)
 LABELLED = {
-    "walker": (partial(people.pedestrian, speed=1.3), 16),
-    "child": (partial(people.pedestrian, speed=0.8, child=True), 16),
-    "stander": (partial(people.pedestrian, speed=0.0), 16),
-    "backpack": (partial(people.pedestrian, speed=1.2, carried="backpack"), 16),
-    "sitting": (people.sitting, 18), "on bench": (partial(people.sitting, chair=False), 16),
-    "cyclist": (cyclists.cyclist, 20), "car": (vehicles.car, 34),
-    "parked": (partial(vehicles.car, driver=False), 34), "van": (vehicles.van, 34),
-    "truck": (heavy_vehicles.truck, 32), "bus": (heavy_vehicles.bus, 32),
-    "tram": (heavy_vehicles.tram, 32)}
+    "walker": (partial(people.make_pedestrian, speed=1.3), 16),
+    "child": (partial(people.make_pedestrian, speed=0.8, child=True), 16),
+    "stander": (partial(people.make_pedestrian, speed=0.0), 16),
+    "backpack": (partial(people.make_pedestrian, speed=1.2, carried="backpack"), 16),
+    "sitting": (people.make_sitting_person, 18),
+    "on bench": (partial(people.make_sitting_person, chair=False), 16),
+    "cyclist": (cyclists.make_cyclist, 20), "car": (vehicles.make_car, 34),
+    "parked": (partial(vehicles.make_car, driver=False), 34), "van": (vehicles.make_van, 34),
+    "truck": (heavy_vehicles.make_truck, 32), "bus": (heavy_vehicles.make_bus, 32),
+    "tram": (heavy_vehicles.make_tram, 32)}
 SCENERY = {
     **{f.__name__: (f, 8) for f in (
-        furniture.pole, furniture.lamp, *furniture.PERSON_SIZED, cyclists.parked_bicycle,
-        cyclists.parked_motorcycle, vegetation.tree, vegetation.conifer, vegetation.bush)},
+        furniture.make_pole, furniture.make_lamp, *furniture.PERSON_SIZED, cyclists.make_bicycle,
+        cyclists.make_motorcycle, vegetation.make_tree, vegetation.make_conifer,
+        vegetation.make_bush)},
     **{f.__name__: (partial(f, length=7.0), 8) for f in (
-        furniture.fence, furniture.wall, vegetation.hedge)},
-    "building": (partial(buildings.building, length=15.0, depth=10.0, storeys=4), 40),
-    "cottage": (partial(buildings.building, length=6.0, depth=8.0, storeys=1), 40)}
+        furniture.make_fence, furniture.make_wall, vegetation.make_hedge)},
+    "building": (partial(buildings.make_building, length=15.0, depth=10.0, storeys=4), 40),
+    "cottage": (partial(buildings.make_building, length=6.0, depth=8.0, storeys=1), 40)}
 SEMANTICS = {10, 11, 15, 16, 18, 20, 30, 31, 50, 51, 70, 71, 80, 81, 99}
 
 
@@ -54,7 +56,7 @@ def made_by(make, seed):
 
 
 def hull(made):
-    low, high = extents(made)
+    low, high = compute_extents(made)
     return low.min(axis=0), high.max(axis=0)
 
 
@@ -90,7 +92,7 @@ def test_the_box_of_a_labelled_thing_is_what_its_body_covers(name):
     for seed in SEEDS:
         thing = make(np.random.default_rng(seed))
         assert thing.label in CLASSES
-        low, high = extents(thing.parts(0.0))
+        low, high = compute_extents(thing.parts(0.0))
         body = np.abs((low + high)[:, 1] / 2) < thing.size[1] / 2  # all but the mirrors
         low, high = low[body].min(axis=0), high[body].max(axis=0)
         length, width, height = thing.size
@@ -120,12 +122,12 @@ def test_the_box_of_a_pedestrian_holds_for_a_whole_stride(name):
 
 def test_a_foot_on_the_ground_does_not_slide():
     for seed in SEEDS:
-        thing = people.pedestrian(np.random.default_rng(seed), 1.3)
+        thing = people.make_pedestrian(np.random.default_rng(seed), 1.3)
         ways = np.linspace(0, stride(thing), 401)
         feet = np.array([thing.parts(x)[-2:] for x in ways])
         tip = feet["centre"][..., 0] + feet["half"][..., 0] * np.cos(feet["pitch"]) + (
             ways[:, None] - feet["half"][..., 2] * np.sin(feet["pitch"]))
-        sole = np.array([extents(f)[0][:, 2] for f in feet])
+        sole = np.array([compute_extents(f)[0][:, 2] for f in feet])
         stands = (sole[1:] < 1e-9) & (sole[:-1] < 1e-9)
         assert (stands.any(axis=1)).all()
         assert np.abs(np.diff(tip, axis=0)[stands]).max() < 1e-6
@@ -133,18 +135,18 @@ def test_a_foot_on_the_ground_does_not_slide():
 
 
 def test_a_walk_repeats_after_a_stride_and_mirrors_after_a_step():
-    thing = people.pedestrian(np.random.default_rng(3), 1.4)
+    thing = people.make_pedestrian(np.random.default_rng(3), 1.4)
     now, later = thing.parts(0.2), thing.parts(0.2 + stride(thing))
     assert np.allclose(now["centre"], later["centre"])
-    low, high = extents(now)
-    low_step, _ = extents(thing.parts(0.2 + stride(thing) / 2))
+    low, high = compute_extents(now)
+    low_step, _ = compute_extents(thing.parts(0.2 + stride(thing) / 2))
     assert np.allclose(np.sort(low[:, 0]), np.sort(low_step[:, 0]))
     assert np.allclose(np.sort(high[:, 1]), np.sort(-low_step[:, 1]))
 
 
 def test_limbs_hold_together():
     """Between their joints, limbs keep their length; knees bend forward."""
-    thing = people.pedestrian(np.random.default_rng(4), 1.4)
+    thing = people.make_pedestrian(np.random.default_rng(4), 1.4)
     height = thing.size[2]
     for x in np.linspace(0, stride(thing), 50):
         thigh, shank = (thing.parts(x)[[-6, -5]], thing.parts(x)[[-4, -3]])
@@ -153,15 +155,15 @@ def test_limbs_hold_together():
 
 
 def test_faster_walkers_take_longer_steps():
-    lengths = [people.pedestrian(np.random.default_rng(1), speed).size[0]
+    lengths = [people.make_pedestrian(np.random.default_rng(1), speed).size[0]
                for speed in (0.5, 0.8, 1.1, 1.4)]
     assert (np.diff(lengths) > 0).all()
 
 
 @pytest.mark.parametrize("carried", people.CARRIED[1:])
 def test_what_is_carried_changes_no_width_or_height_of_the_box(carried):
-    plain = people.pedestrian(np.random.default_rng(2), 1.2)
-    loaded = people.pedestrian(np.random.default_rng(2), 1.2, carried=carried)
+    plain = people.make_pedestrian(np.random.default_rng(2), 1.2)
+    loaded = people.make_pedestrian(np.random.default_rng(2), 1.2, carried=carried)
     assert len(loaded.parts(0.0)) > len(plain.parts(0.0))
     assert loaded.size[1:] == plain.size[1:]
     low, _ = hull(loaded.parts(0.3))
@@ -170,10 +172,10 @@ def test_what_is_carried_changes_no_width_or_height_of_the_box(carried):
 
 def test_wheels_stay_on_the_road_while_pedals_turn():
     for seed in SEEDS:
-        thing = cyclists.cyclist(np.random.default_rng(seed))
+        thing = cyclists.make_cyclist(np.random.default_rng(seed))
         poses = [thing.parts(x) for x in np.linspace(0, 5, 41)]
         for made in poses:
-            assert np.allclose(extents(made[:2])[0][:, 2], 0.0, atol=1e-9)
+            assert np.allclose(compute_extents(made[:2])[0][:, 2], 0.0, atol=1e-9)
             low, high = hull(made)
             assert np.allclose(high - low, thing.size, atol=1e-6)
         assert not np.array_equal(poses[0]["centre"], poses[4]["centre"])
@@ -181,8 +183,8 @@ def test_wheels_stay_on_the_road_while_pedals_turn():
 
 @pytest.mark.parametrize("style", ["HATCHBACK", "SEDAN", "ESTATE", "SUV", "MINIBUS", "PANEL_VAN"])
 def test_vehicles_are_alike_left_and_right(style):
-    made = vehicles.body((4.2, 1.7, 1.6), getattr(vehicles, style), 0.3, 0.8, driver=False)
-    low, high = extents(made)
+    made = vehicles.make_body((4.2, 1.7, 1.6), getattr(vehicles, style), 0.3, 0.8, driver=False)
+    low, high = compute_extents(made)
     mirrored = np.stack([low[:, 0], -high[:, 1], low[:, 2], high[:, 0], -low[:, 1], high[:, 2]], 1)
     there = np.hstack([low, high])
     far = np.abs(mirrored[:, None] - there).max(axis=2).min(axis=1)
@@ -191,8 +193,8 @@ def test_vehicles_are_alike_left_and_right(style):
 
 def test_a_beam_from_the_side_can_pass_a_car_between_its_panes():
     """Above the belt, behind the screens, there is nothing solid but pillars and seats."""
-    made = vehicles.body((4.0, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.85, driver=False)
-    low, high = extents(made)
+    made = vehicles.make_body((4.0, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.85, driver=False)
+    low, high = compute_extents(made)
     x, z = -0.45, 1.25  # between the pillars in the middle and at the back, above the seats
     met = (low[:, 0] < x) & (x < high[:, 0]) & (low[:, 2] < z) & (z < high[:, 2])
     assert (made["transmission"][met] > 0.5).all() and met.sum() == 2
@@ -202,10 +204,10 @@ def points_of(thing, distance, yaw, seed):
     """xyz that the HDL-64E has of a thing, alone in the world, so far ahead; z above its bottom."""
     made = thing.parts(0.4 * seed)
     base = np.tile([distance, 0.0, -1.73], (len(made), 1))
-    solids = place(made, base, np.full(len(made), yaw), np.ones(len(made)),
-                   np.zeros((len(made), 3)))
-    hits = cast(solids, Ground(), np.array([0.0, 0.0, 1e4]), HDL64E, STILL, seed)
-    xyz = returns_of(hits, HDL64E, STILL, np.random.default_rng(seed)).xyz
+    solids = place_parts(made, base, np.full(len(made), yaw), np.ones(len(made)),
+                         np.zeros((len(made), 3)))
+    hits = cast_rays(solids, Ground(), np.array([0.0, 0.0, 1e4]), HDL64E, NO_MOTION, seed)
+    xyz = make_returns(hits, HDL64E, NO_MOTION, np.random.default_rng(seed)).xyz
     return xyz + np.array([0.0, 0.0, 1.73])
 
 
@@ -213,7 +215,7 @@ def test_as_much_of_a_cyclist_is_low_as_of_those_of_kitti():
     """Below 0.42 of the height lie 46 % of the points of 10 of KITTI's."""
     shares = []
     for seed in SEEDS:
-        thing = cyclists.cyclist(np.random.default_rng(seed))
+        thing = cyclists.make_cyclist(np.random.default_rng(seed))
         heights = points_of(thing, 20.0, 0.5 * seed, seed)[:, 2]
         shares.append((heights[heights > 0.15] < 0.42 * thing.size[2]).mean())
     assert 0.40 < np.mean(shares) < 0.52
@@ -226,7 +228,7 @@ def test_little_of_a_car_is_above_its_belt_and_the_farther_the_less(distance, lo
     seen from behind, 12 to 25, 25 to 40 and 40 to 70 m away, in streets, which hide what is low."""
     shares = []
     for seed in range(16):
-        thing = vehicles.car(np.random.default_rng(seed))
+        thing = vehicles.make_car(np.random.default_rng(seed))
         heights = points_of(thing, distance, 0.0, seed)[:, 2] / thing.size[2]
         if (heights > 0.15).sum() >= 8:
             shares.append((heights[heights > 0.15] > 0.65).mean())
@@ -236,7 +238,7 @@ def test_little_of_a_car_is_above_its_belt_and_the_farther_the_less(distance, lo
 @cache
 def cars_from_the_front():
     """24 cars, and their points from 20 m away."""
-    cars = [vehicles.car(np.random.default_rng(seed)) for seed in range(24)]
+    cars = [vehicles.make_car(np.random.default_rng(seed)) for seed in range(24)]
     return [(car, points_of(car, 20.0, np.pi + 0.05 * (seed % 5 - 2), seed))
             for seed, car in enumerate(cars)]
 
@@ -257,7 +259,7 @@ def test_only_the_bumper_of_a_car_is_as_far_in_front_as_its_box(zone, low, high)
 
 @pytest.mark.parametrize("length", [3.2, 3.8, 4.5])
 def test_seats_do_not_tell_how_long_a_car_is(length):
-    made = vehicles.body((length, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.8, driver=False)
+    made = vehicles.make_body((length, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.8, driver=False)
     seats = made[np.isclose(made["transmission"], 0.75)]
     assert len(seats) == 2 and np.ptp(seats["centre"][:, 0]) > 0.4
 
@@ -303,6 +305,6 @@ def test_scenery_stands_on_or_in_the_ground(name):
 def test_rods_and_discs_end_where_they_should():
     made = parts([rod((0, 0, 0), (3, 4, 12), 1e-6), disc((1, 2, 3), 0.5, 0.1),
                   block((1, -1, 2), (0, 1, 0))], 10)
-    low, high = extents(made)
+    low, high = compute_extents(made)
     assert np.allclose(low, [(0, 0, 0), (0.5, 1.9, 2.5), (0, -1, 0)], atol=1e-5)
     assert np.allclose(high, [(3, 4, 12), (1.5, 2.1, 3.5), (1, 1, 2)], atol=1e-5)

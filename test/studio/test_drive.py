@@ -11,7 +11,7 @@ from test_proposals import SEED
 
 from lidar_perception.data.frame import Recording
 from lidar_perception.geometry import box_corners
-from lidar_perception.simulation.to_bag import simulated_scans
+from lidar_perception.simulation.recording import simulate_frames
 from lidar_perception.types import InputError
 from lidar_studio.drive import Clouds, Scan, one_drive
 from lidar_studio.snap import around_click, headed, to_size
@@ -39,7 +39,7 @@ def test_clouds_keep_to_their_bound_and_are_made_once():
 
 
 def test_a_recording_of_several_drives_wants_one_named():
-    frames = [*simulated_scans(SEED, 2, streets_of=1)]
+    frames = [*simulate_frames(SEED, 2, streets_of=1)]
     recording = Recording(Path("two"), "simulated", frames)
     with pytest.raises(InputError, match="--sequence"):
         one_drive(recording)

@@ -17,7 +17,7 @@ from lidar_perception.classes import CAR
 from lidar_perception.data.frame import BOXES, POSES, Recording
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.geometry import points_in_box
-from lidar_perception.simulation.to_bag import simulated_scans
+from lidar_perception.simulation.recording import simulate_frames
 from lidar_perception.types import InputError
 from lidar_studio import survey_cache
 from lidar_studio.alike import alike
@@ -33,7 +33,7 @@ SEED, FRAMES = 119, 6  # a street with people near and far
 
 @pytest.fixture(scope="module")
 def drive(streets):
-    frames = list(simulated_scans(SEED, FRAMES, streets_of=20))
+    frames = list(simulate_frames(SEED, FRAMES, streets_of=20))
     return Drive("simulated", Recording(Path("simulated"), "simulated", frames,
                                         frozenset({BOXES, POSES})))
 

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidar_perception.simulation.sensor import generic
+from lidar_perception.simulation.sensor import make_generic_sensor
 from lidar_perception.simulation.solids import Solids
 from lidar_perception.simulation.terrain import Ground
 
-SENSOR = generic(24, -24.0, 12.0, 1.0, 10.0, height=1.7, max_range=60.0, divergence=0.0,
-                 lifts=tuple(np.linspace(0.2, 0.0, 24)))
+SENSOR = make_generic_sensor(24, -24.0, 12.0, 1.0, 10.0, height=1.7, max_range=60.0, divergence=0.0,
+                             lifts=tuple(np.linspace(0.2, 0.0, 24)))
 OVER_ROAD = np.array([0.0, 0.0, SENSOR.height])
 FULL = Ground(0.01, -0.02, 0.05, 20.0, 0.02, 6.0, -4.0, 0.13, 2.0, ((8.0, 15.0), (-30.0, -22.0)),
               1.5)

@@ -3,9 +3,9 @@
 from click.testing import CliRunner
 
 from lidar_perception.cli.simulate import simulate
-from lidar_perception.simulation.sensor import generic
+from lidar_perception.simulation.sensor import make_generic_sensor
 
-TINY = generic(16, -14.0, 3.0, 2.0, 10.0)
+TINY = make_generic_sensor(16, -14.0, 3.0, 2.0, 10.0)
 
 
 def arguments(out, layout="kitti", frames=5, jobs=1, *more):

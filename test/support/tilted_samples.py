@@ -8,11 +8,11 @@ import numpy as np
 from numba import njit
 
 from lidar_perception.simulation import drive
-from lidar_perception.simulation.raycast import Hits, cast
-from lidar_perception.simulation.returns import returns_of
-from lidar_perception.simulation.scene import ANY
-from lidar_perception.simulation.sensor import Motion, Sensor, rays, sensor_named
-from lidar_perception.simulation.terrain import Ground, cast_ground, compiled, surface_height
+from lidar_perception.simulation.raycast import Hits, cast_rays
+from lidar_perception.simulation.returns import make_returns
+from lidar_perception.simulation.scene import ALL_STREETS
+from lidar_perception.simulation.sensor import Motion, Sensor, find_sensor, make_rays
+from lidar_perception.simulation.terrain import Ground, cast_ground, surface_height, to_compiled
 from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
@@ -72,7 +72,7 @@ def simulate_tilted(sensor: Sensor, roll: float, pitch: float, street: int, numb
 
     even: the street has slopes and curbs, but is smooth otherwise.
     """
-    scene = drive._scene(street, ANY)
+    scene = drive._make_cached_scene(street, ALL_STREETS)
     ground = scene.ground._replace(**EVEN) if even else scene.ground
     scene = replace(scene, ground=ground)
     sensor = sensor.at_turn(number)
@@ -84,18 +84,18 @@ def simulate_tilted(sensor: Sensor, roll: float, pitch: float, street: int, numb
                      @ world, axes=world.T @ moment.solids.axes,
                      velocity=moment.solids.velocity @ world)
     motion = Motion(tuple(np.array(moment.motion.velocity) @ world))
-    hits = cast(solids, Ground(), np.array([0.0, 0.0, 1e6]), sensor, motion, street)
-    made = rays(sensor, motion)
+    hits = cast_rays(solids, Ground(), np.array([0.0, 0.0, 1e6]), sensor, motion, street)
+    made = make_rays(sensor, motion)
     lift = np.outer(sensor.lifts or np.zeros(sensor.rings), world[:, 2])
-    on_ground = _cast_ground(compiled(ground), position, made.direction @ world.T, made.since,
+    on_ground = _cast_ground(to_compiled(ground), position, made.direction @ world.T, made.since,
                              np.array(moment.motion.velocity), lift, sensor.max_range)
     nearer = on_ground[..., 0] < hits.range
     merged = [np.where(nearer, on_ground[..., i], part)
               for i, part in enumerate((hits.range, hits.brightness, hits.cosine))]
     owner = np.where(nearer, 0, hits.owner)
     semantic = np.where(nearer, on_ground[..., 3], hits.semantic).astype(np.uint16)
-    return returns_of(Hits(*merged, owner, semantic, hits.solid, hits.reached), sensor, motion,
-                      np.random.default_rng([street, number]), compensated=False)
+    return make_returns(Hits(*merged, owner, semantic, hits.solid, hits.reached), sensor, motion,
+                        np.random.default_rng([street, number]), compensated=False)
 
 
 def make_cloud(returns, driver: dict, stamp_ns: int, rings: int, frame_id: str = "lidar"):
@@ -123,7 +123,7 @@ def make_cloud(returns, driver: dict, stamp_ns: int, rings: int, frame_id: str =
 def simulate_clouds(name: str, count: int = 4, even: bool = True, street: int = 40):
     """Yield clouds of a sensor on its mount of MOUNTS, each pair on another street."""
     driver, roll, pitch, height = MOUNTS[name]
-    sensor = replace(sensor_named(name), height=height)
+    sensor = replace(find_sensor(name), height=height)
     for i in range(count):
         returns = simulate_tilted(sensor, roll, pitch, street + i // 2, 20 + i % 2, even)
         yield make_cloud(returns, driver, round(1e9 * (10 * (i // 2) + (i % 2) / sensor.rate)),

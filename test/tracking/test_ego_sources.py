@@ -12,7 +12,7 @@ import pytest
 from tracking_samples import pose
 
 from lidar_perception.data.frame import POSES, Frame, Recording
-from lidar_perception.simulation.drive import scans
+from lidar_perception.simulation.drive import simulate_drive
 from lidar_perception.tracking import drive_tracker, ego
 from lidar_perception.tracking.drive_tracker import LOOKED_AT, ego_of
 from lidar_perception.tracking.ego import (
@@ -90,7 +90,7 @@ def test_without_the_extra_it_is_said_how_to_get_it(monkeypatch):
 @pytest.fixture(scope="module")
 def drive():
     pytest.importorskip("kiss_icp", reason="needs kiss-icp, the extra [odometry]")
-    return [(scan.frame.xyz, scan.pose) for scan in scans(5, 6)]
+    return [(scan.frame.xyz, scan.pose) for scan in simulate_drive(5, 6)]
 
 
 def test_odometry_says_how_a_simulated_drive_went_and_always_the_same(drive):

@@ -13,8 +13,8 @@ from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet.config import NETWORKS
 from lidar_perception.detectors.pointnet.network import load_pointnet
 from lidar_perception.detectors.pointnet.weights_file import judge_file
-from lidar_perception.simulation.drive import scan_at
-from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.simulation.drive import simulate_scan
+from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.training.params import PointNetTraining
 from lidar_perception.types import InputError
 
@@ -49,7 +49,7 @@ def test_trained_network_opens_as_detector(cache, tmp_path):
     assert {"score", "accuracy", "calibration_error"} <= set(header.metrics)
     json.loads(header.text())
     assert network.offsets.abs().sum() > 0  # calibrated
-    open_detector(out / "last.safetensors", "cpu")(scan_at(3, 0, sensor_named(SENSOR)).frame)
+    open_detector(out / "last.safetensors", "cpu")(simulate_scan(3, 0, find_sensor(SENSOR)).frame)
     # the same seed gives the same weights, also from the cache
     again = train(cache, tmp_path / "again")
     assert again.exit_code == 0

@@ -15,8 +15,8 @@ from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.pointpillars import config as config_module
 from lidar_perception.detectors.pointpillars.detector import load_detector
-from lidar_perception.simulation.drive import scan_at
-from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.simulation.drive import simulate_scan
+from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.training.params import PAPER_SHARE, DataParams, PointPillarsTraining
 from lidar_perception.training.sources import open_sources
 from lidar_perception.types import InputError
@@ -68,7 +68,7 @@ def test_trained_network_opens_as_detector(
     assert "score" in header.metrics and header.commit
     json.loads(header.text())
     detector = load_detector(out / "best.safetensors", "cpu")
-    detector(scan_at(3, 0, sensor_named(SENSOR)).frame)
+    detector(simulate_scan(3, 0, find_sensor(SENSOR)).frame)
     # a finished run does not change
     before = (out / "last.safetensors").read_bytes()
     again = train(*sim(cache, out), "--version", "v4", "--seed", 5)

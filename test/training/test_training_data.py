@@ -24,9 +24,9 @@ from lidar_perception.detectors.pointpillars.config import RANGES, network_confi
 from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED, dense
 from lidar_perception.geometry import is_within, wrap_angle
 from lidar_perception.simulation import drive
-from lidar_perception.simulation.camera import kitti_labels, turned_camera
+from lidar_perception.simulation.camera import make_kitti_labels, turn_camera
 from lidar_perception.simulation.scene import Scenes
-from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.training import scenes as scenes_module
 from lidar_perception.training.augment import TrainingScene, raise_scene
 from lidar_perception.training.cut_objects import cut_objects
@@ -54,7 +54,7 @@ from lidar_perception.types import (
 pytestmark = pytest.mark.no_cover  # covered by other tests
 
 CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
-SENSOR = sensor_named("generic:8,-20,4,2,10")
+SENSOR = find_sensor("generic:8,-20,4,2,10")
 
 
 # simulated scenes
@@ -68,7 +68,7 @@ def test_cached_scans_equal_simulated_ones(tmp_path, monkeypatch):
         assert np.array_equal(frame.xyz, again[0].xyz)
         assert np.array_equal(frame.intensity, again[0].intensity)
         assert np.array_equal(truth.boxes, again[1].boxes) and truth.extras == again[1].extras
-        monkeypatch.setattr(scenes_module, "scan_at", None)  # the second comes from the cache
+        monkeypatch.setattr(scenes_module, "simulate_scan", None)  # the second comes from the cache
     monkeypatch.undo()
     file, = (tmp_path / "cache").iterdir()
     file.write_bytes(file.read_bytes()[:100])  # a broken one is made again
@@ -84,7 +84,7 @@ def test_hidden_simulated_objects_are_not_wanted():
     scene = source.scene(0)
     seen = [e["visible"] >= 0.15 and e["num_points"] >= 5 for e in truth.extras]
     assert scene.around and scene.wanted.tolist() == seen and 0 < sum(seen) < len(seen)
-    assert drive.scan_at(7, 0, SENSOR).frame.xyz.shape == scene.points[:, :3].shape
+    assert drive.simulate_scan(7, 0, SENSOR).frame.xyz.shape == scene.points[:, :3].shape
     assert scene.height == source.frame(0).sensor_height == 1.73
 
 
@@ -298,12 +298,12 @@ def test_labels_in_turned_camera_equal_those_of_turned_scene(quarter):
     boxes = truth.boxes.copy()
     boxes[:, :2] = boxes[:, :2] @ np.array([[cos, sin], [-sin, cos]])
     boxes[:, 6] = wrap_angle(boxes[:, 6] - yaw)
-    turned = kitti_labels(GroundTruth.of(boxes, truth.class_ids, truth.extras))
-    seen = kitti_labels(truth, turned_camera(yaw))
+    turned = make_kitti_labels(GroundTruth.of(boxes, truth.class_ids, truth.extras))
+    seen = make_kitti_labels(truth, turn_camera(yaw))
     assert [e["track_id"] for e in seen.extras] == [e["track_id"] for e in turned.extras]
     assert len(seen.notes) == len(turned.notes)
     frame = SimulatedScenes(4, 8, SENSOR, around=True).frame(quarter + 4)
-    assert np.allclose(frame.calibration().lidar_to_camera, turned_camera(yaw).lidar_to_camera)
+    assert np.allclose(frame.calibration().lidar_to_camera, turn_camera(yaw).lidar_to_camera)
 
 
 def test_reduced_range_around_keeps_all_directions():

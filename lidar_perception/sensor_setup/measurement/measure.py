@@ -41,7 +41,7 @@ from lidar_perception.sensor_setup.measurement.scans import (
     require_3d,
 )
 from lidar_perception.sensor_setup.measurement.timing import Timing, measure_timing
-from lidar_perception.simulation.sensor import NAMES, sensor_named
+from lidar_perception.simulation.sensor import SENSOR_NAMES, find_sensor
 from lidar_perception.types import InputError
 
 MAX_MODEL_ERROR = 0.15  # degrees between the beams of sensors of one model, the median
@@ -108,7 +108,7 @@ class ScanPattern(NamedTuple):
         """
         if not self.model or self.beams is None:
             return False
-        count, model_count = len(self.beams.elevations), sensor_named(self.model).rings
+        count, model_count = len(self.beams.elevations), find_sensor(self.model).rings
         return count < model_count or (self.is_moved and count == model_count)
 
 
@@ -263,9 +263,9 @@ def match_model(beams: Beams | None) -> tuple[str, float]:
     best, error = "", MAX_MODEL_ERROR
     if beams is None:
         return best, np.nan
-    for name in NAMES:
-        elevations = np.degrees(sensor_named(name).elevations)
-        if sensor_named(name).wander or not (
+    for name in SENSOR_NAMES:
+        elevations = np.degrees(find_sensor(name).elevations)
+        if find_sensor(name).wander or not (
                 0.75 <= len(beams.elevations) / len(elevations) <= 1.05):
             continue
         is_complete = len(beams.elevations) == len(elevations)

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidar_perception.sensor_setup.measurement.beams import Beams
 from lidar_perception.sensor_setup.measurement.measure import MIN_OUTDOOR_RANGE_M, SensorMeasurement
-from lidar_perception.simulation.sensor import Sensor, sensor_named
+from lidar_perception.simulation.sensor import Sensor, find_sensor
 
 DEFAULT_STEP = 0.2  # degrees
 
@@ -37,7 +37,7 @@ def _turn_upside_down(sensor: Sensor) -> Sensor:
 
 def _make_in_own_frame(m: SensorMeasurement) -> Sensor:
     pattern, coverage, mounting = m.pattern, m.view.coverage, m.mounting
-    model = sensor_named(pattern.model) if pattern.model else None
+    model = find_sensor(pattern.model) if pattern.model else None
     fields: dict[str, Any] = {} if model is None else {name: getattr(model, name) for name in (
         "divergence", "reach", "pulse", "min_range", "max_range", "range_noise", "rate", "silent",
         "floor", "fade")}

@@ -17,7 +17,7 @@ from lidar_perception.robot.poses import transform_points
 from lidar_perception.sensor_setup.measurement.measure import SensorMeasurement
 from lidar_perception.sensor_setup.measurement.scans import RETROREFLECTOR
 from lidar_perception.sensor_setup.report.params import choose_params
-from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.types import PointCloud
 
 BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#999999"  # Okabe and Ito, 2008
@@ -66,7 +66,7 @@ def _draw_beams(figure: Any, m: SensorMeasurement) -> bool:
     left.hlines(beams.elevations, 0, edge, color=BLUE, linewidth=0.4)
     difference = np.zeros(len(beams.elevations))
     if model:
-        expected = np.degrees(sensor_named(model).elevations)
+        expected = np.degrees(find_sensor(model).elevations)
         difference = beams.elevations - expected[
             np.abs(beams.elevations[:, None] - expected).argmin(axis=1)]
     right.errorbar(difference, np.arange(len(difference)), xerr=beams.error, fmt=".", color=BLUE,

@@ -22,7 +22,7 @@ LINE_WIDTH = 98
 
 
 def format_sensor(m: SensorMeasurement) -> str:
-    """Return the text of sensor.yaml, see simulation.sensor.sensor_from_file."""
+    """Return the text of sensor.yaml, see simulation.sensor.load_sensor."""
     sensor = make_sensor(m)
     comments = _explain_sensor(m, sensor)
     values = {"name": m.pattern.model or "measured", "height": sensor.height, "rate": sensor.rate,

@@ -8,7 +8,7 @@ from lidar_perception.sensor_setup.measurement.coverage import MIN_FAR_M
 from lidar_perception.sensor_setup.measurement.measure import MIN_OUTDOOR_RANGE_M, SensorMeasurement
 from lidar_perception.sensor_setup.measurement.motion import MAX_OFF_AXIS, wrap_degrees
 from lidar_perception.sensor_setup.measurement.recorded_poses import FOOTPRINT
-from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.simulation.sensor import find_sensor
 
 MAX_SLOPE_SPREAD = 1.0  # degrees from scan to scan, beyond which the ground slopes
 MAX_HEIGHT_M = 5.0      # more than robots have
@@ -53,8 +53,8 @@ def _check_beams(m: SensorMeasurement) -> list[str]:
                 "joined or moved, or their frame is turned against the sensor; sensor.yaml has a "
                 "grid of the same view instead; record the driver's own cloud if possible"]
     warnings = []
-    if pattern.model and len(beams.elevations) < sensor_named(pattern.model).rings:
-        warnings.append(f"{len(beams.elevations)} of the {sensor_named(pattern.model).rings} beams "
+    if pattern.model and len(beams.elevations) < find_sensor(pattern.model).rings:
+        warnings.append(f"{len(beams.elevations)} of the {find_sensor(pattern.model).rings} beams "
                         f"of {pattern.model} were seen, so sensor.yaml has all beams of the model; "
                         "to measure them, record where all of them have returns")
     if pattern.is_moved:

@@ -8,11 +8,12 @@ from lidar_perception.simulation.shapes.thing import GLASS, METAL, block
 from lidar_perception.simulation.solids import parts
 
 BUILDING = 50
-FOOT = -1.0  # how deep a house reaches into the ground, m
-ROOM = 3.0  # depth of the rooms behind the front, m
+FOOT_M = -1.0  # how deep a house reaches into the ground, m
+ROOM_DEPTH_M = 3.0  # depth of the rooms behind the front, m
 
 
-def building(rng: np.random.Generator, length: float, depth: float, storeys: int) -> np.ndarray:
+def make_building(rng: np.random.Generator, length: float, depth: float,
+                  storeys: int) -> np.ndarray:
     """(P,) PART of a house along x, centred, whose front is at y = 0 and looks to -y; depth at
     least 4 m. Piers and deep bands, which are the floors, leave the windows open; a beam goes
     through the glass or not. Base, sills, balconies and the edge of the roof stand out of the
@@ -25,32 +26,33 @@ def building(rng: np.random.Generator, length: float, depth: float, storeys: int
     count = max(int(length / rng.uniform(2.8, 4.0)), 1)
     pitch, pier = length / count, rng.uniform(0.35, 0.6)
     places = [(i - count / 2) * pitch for i in range(count + 1)]
-    rows = [block((-x, ROOM, FOOT), (x, depth, top), reflectance=0.2)]
-    rows += [block((max(at - pier * pitch / 2, -x), 0, FOOT), (min(at + pier * pitch / 2, x), 0.35,
-                                                               top), **wall) for at in places]
-    rows += [block((side * x, 0.3, FOOT), (side * (x - 0.3), depth, top), **wall)
+    rows = [block((-x, ROOM_DEPTH_M, FOOT_M), (x, depth, top), reflectance=0.2)]
+    rows += [block((max(at - pier * pitch / 2, -x), 0, FOOT_M),
+                   (min(at + pier * pitch / 2, x), 0.35, top), **wall) for at in places]
+    rows += [block((side * x, 0.3, FOOT_M), (side * (x - 0.3), depth, top), **wall)
              for side in (-1, 1)]
     sill = rng.uniform(0.8, 1.0)
     for below, above in zip([0.0, *floors[:-1]], floors):
-        rows += [block((-x, 0.02, above - 0.55), (x, ROOM, above), **wall),
-                 block((-x, 0.02, below if below else FOOT), (x, 0.33, below + sill), **wall),
+        rows += [block((-x, 0.02, above - 0.55), (x, ROOM_DEPTH_M, above), **wall),
+                 block((-x, 0.02, below if below else FOOT_M), (x, 0.33, below + sill), **wall),
                  block((-x, 0.15, below + sill), (x, 0.17, above - 0.55), reflectance=GLASS,
                        transmission=rng.uniform(0.5, 0.75))]
     door = (places[count // 2] + places[count // 2 + 1]) / 2 if count > 1 else 0.0
     half = (1 - pier) * pitch / 2
-    rows += [block((door - half, 0.0, FOOT), (door + half, 0.1, 2.1), reflectance=0.25),
+    rows += [block((door - half, 0.0, FOOT_M), (door + half, 0.1, 2.1), reflectance=0.25),
              block((door - half - 0.1, -0.3, -0.3), (door + half + 0.1, 0.0, 0.15),
                    reflectance=0.4),
-             block((-x, -0.05, FOOT), (x, 0.0, rng.uniform(0.4, 0.8)), reflectance=0.8 * tone),
+             block((-x, -0.05, FOOT_M), (x, 0.0, rng.uniform(0.4, 0.8)), reflectance=0.8 * tone),
              block((-x, -rng.uniform(0.2, 0.6), top), (x, depth, top + 0.25), reflectance=0.3)]
     if rng.random() < 0.6:  # the ridge of the roof
         rows.append(block((-x, 0.3 * depth, top), (x, 0.7 * depth, top + rng.uniform(1.5, 3.0)),
                           reflectance=0.3))
-    rows += [row for below in floors[:-1] for row in _front_of(rng, below, sill, x, places, pitch)]
+    rows += [row for below in floors[:-1]
+             for row in _decorate_front(rng, below, sill, x, places, pitch)]
     return parts(rows, BUILDING)
 
 
-def glass_hall(rng: np.random.Generator, length: float, depth: float) -> np.ndarray:
+def make_glass_hall(rng: np.random.Generator, length: float, depth: float) -> np.ndarray:
     """(P,) PART of a hall along x, centred, whose front at y = 0, which looks to -y, is all glass
     between posts: a beam goes through or not, and then on to columns and walls within. A roof
     stands out of it; at most 40 parts for 30 m."""
@@ -58,21 +60,21 @@ def glass_hall(rng: np.random.Generator, length: float, depth: float) -> np.ndar
     posts = np.linspace(-x, x, max(int(length / rng.uniform(1.8, 3.5)), 1) + 1)
     rows = [block((-x, 0.04, 0.05), (x, 0.06, high), reflectance=GLASS,
                   transmission=rng.uniform(0.5, 0.85)),
-            block((-x, 0.0, FOOT), (x, 0.1, rng.uniform(0.05, 0.3)), reflectance=METAL),
+            block((-x, 0.0, FOOT_M), (x, 0.1, rng.uniform(0.05, 0.3)), reflectance=METAL),
             block((-x, 0.0, 2.3), (x, 0.1, 2.45), reflectance=METAL),
-            block((-x, depth - 0.3, FOOT), (x, depth, high), **wall),
+            block((-x, depth - 0.3, FOOT_M), (x, depth, high), **wall),
             block((-x - 0.3, -rng.uniform(0.2, 3.0), high), (x + 0.3, depth, high + 0.5), **wall)]
-    rows += [block((s * x, 0.0, FOOT), (s * (x - 0.3), depth, high), **wall) for s in (-1, 1)]
-    rows += [block((at - 0.04, -0.03, FOOT), (at + 0.04, 0.15, high), reflectance=METAL)
+    rows += [block((s * x, 0.0, FOOT_M), (s * (x - 0.3), depth, high), **wall) for s in (-1, 1)]
+    rows += [block((at - 0.04, -0.03, FOOT_M), (at + 0.04, 0.15, high), reflectance=METAL)
              for at in posts]
     inside = rng.uniform((-0.9 * x, 1.5, 0.1, 0.9), (0.9 * x, depth - 1.0, 0.5, high), (4, 4))
-    rows += [block((at - half, y - half, FOOT), (at + half, y + half, top), reflectance=0.4)
+    rows += [block((at - half, y - half, FOOT_M), (at + half, y + half, top), reflectance=0.4)
              for at, y, half, top in inside.tolist()]
     return parts(rows, BUILDING)
 
 
-def _front_of(rng: np.random.Generator, below: float, sill: float, x: float, places: list[float],
-              pitch: float) -> list[tuple]:
+def _decorate_front(rng: np.random.Generator, below: float, sill: float, x: float,
+                    places: list[float], pitch: float) -> list[tuple]:
     """A sill along an upper storey, or a balcony on it, or nothing."""
     pick = rng.random()
     if pick < 0.35:

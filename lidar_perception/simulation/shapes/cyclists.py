@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidar_perception.classes import CLASSES, CYCLIST
-from lidar_perception.simulation.shapes.people import knee
+from lidar_perception.simulation.shapes.people import find_knee
 from lidar_perception.simulation.shapes.thing import (
     METAL,
     PLATE,
@@ -24,13 +24,13 @@ from lidar_perception.simulation.shapes.thing import (
 from lidar_perception.simulation.solids import BOX, ELLIPSOID, part, parts
 
 BICYCLE, MOTORCYCLE, BICYCLIST = 11, 15, 31
-CRANK, GEAR = 0.17, 5.0  # metres: length of a crank, way for one turn of the cranks
-SPOKES = 0.5            # share of the beams that pass between the spokes
-OPEN = 0.6              # likewise between stays, chain and pedals, and through the rack
+CRANK_M, GEAR_M = 0.17, 5.0  # metres: length of a crank, way for one turn of the cranks
+SPOKE_TRANSMISSION = 0.5            # share of the beams that pass between the spokes
+FRAME_TRANSMISSION = 0.6  # between stays, chain and pedals, and through the rack
 THIGH, SHANK = 0.26, 0.27  # lengths as shares of the rider's height, down to the pedal
 
 
-class Rider(NamedTuple):
+class RiderBuild(NamedTuple):
     """A rider on a bicycle. size: length, width, height in metres; lean: of the trunk, radians;
     phase: of the cranks, radians; frame, coat, trousers, head: reflectances; load: "", "basket",
     or "backpack"."""
@@ -45,16 +45,16 @@ class Rider(NamedTuple):
     load: str = ""
 
 
-def cyclist(rng: np.random.Generator) -> Thing:
+def make_cyclist(rng: np.random.Generator) -> Thing:
     """Someone who rides; the box's length is the bicycle's, its width the handlebar's."""
     size = draw_size(rng, CLASSES[CYCLIST])
-    rider = Rider(size, rng.uniform(0.15, 0.6), rng.uniform(0, 2 * pi), rng.uniform(0.1, 0.8),
-                  rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75), rng.uniform(0.15, 0.75),
-                  ("", "basket", "backpack")[rng.integers(3)])
-    return Thing(partial(riding, rider=rider), size, CLASSES[CYCLIST])
+    rider = RiderBuild(size, rng.uniform(0.15, 0.6), rng.uniform(0, 2 * pi), rng.uniform(0.1, 0.8),
+                       rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75), rng.uniform(0.15, 0.75),
+                       ("", "basket", "backpack")[rng.integers(3)])
+    return Thing(partial(pose_rider, rider=rider), size, CLASSES[CYCLIST])
 
 
-def riding(travelled: float, rider: Rider) -> np.ndarray:
+def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
     """(P,) PART of a rider after so many metres; the cranks turn, the wheels are discs that let
     half of the beams pass."""
     length, width, height = rider.size
@@ -70,7 +70,7 @@ def riding(travelled: float, rider: Rider) -> np.ndarray:
     bar_x, bar_z = 0.22 * length, 0.61 * height
     head = (neck[0] + 0.03, 0.0, height - 0.075 * trunk)
     rows = [
-        *_bicycle(length, width / 2, (bar_x, bar_z), rider.frame),
+        *_bicycle_parts(length, width / 2, (bar_x, bar_z), rider.frame),
         part(ELLIPSOID, head, (0.057 * trunk, 0.047 * trunk, 0.075 * trunk),
              reflectance=(SKIN + rider.head) / 2),
         part(ELLIPSOID, (along(0.15)[0], 0.0, along(0.15)[1]),
@@ -78,11 +78,11 @@ def riding(travelled: float, rider: Rider) -> np.ndarray:
              reflectance=rider.coat),
         part(ELLIPSOID, (hip[0], 0.0, seat + 0.02), (0.16, min(0.17, 0.4 * width), 0.11),
              reflectance=rider.trousers)]
-    turn = rider.phase + 2 * pi * travelled / GEAR
+    turn = rider.phase + 2 * pi * travelled / GEAR_M
     for side, at in ((-1, turn), (1, turn + pi)):
-        foot = (-0.02 * length + CRANK * sin(at), 0.17 * height + CRANK * cos(at))
+        foot = (-0.02 * length + CRANK_M * sin(at), 0.17 * height + CRANK_M * cos(at))
         thigh, shank = THIGH * trunk, SHANK * trunk
-        x, z = knee(hip, foot, thigh, shank)
+        x, z = find_knee(hip, foot, thigh, shank)
         y = side * 0.11
         rows += [rod((*hip[:1], y, seat), (x, y, z), 0.085, reflectance=rider.trousers),
                  rod((x, y, z), (foot[0], y, foot[1] + 0.03), 0.06, reflectance=rider.trousers),
@@ -99,32 +99,33 @@ def riding(travelled: float, rider: Rider) -> np.ndarray:
     return parts(rows, BICYCLIST)
 
 
-def _bicycle(length: float, half_bar: float, bar: tuple, frame: float) -> list[tuple]:
+def _bicycle_parts(length: float, half_bar: float, bar: tuple, frame: float) -> list[tuple]:
     """Wheels, what is between and above them, tubes and handlebar, with bar (x, z). As thick as
     wide beams see it: 46 % of the points of KITTI's cyclists are lower than 0.42 of their height,
     22 % also more than 0.35 m ahead of the middle or behind it (10 cyclists up to 40 m)."""
     radius = 0.19 * length
     axle, crank = length / 2 - radius, (-0.02 * length, 0.0, 0.88 * radius)
-    return [disc((-axle, 0, radius), radius, 0.03, reflectance=0.3, transmission=SPOKES),
-            disc((axle, 0, radius), radius, 0.03, reflectance=0.3, transmission=SPOKES),
+    wheel = dict(reflectance=0.3, transmission=SPOKE_TRANSMISSION)
+    return [disc((-axle, 0, radius), radius, 0.03, **wheel),
+            disc((axle, 0, radius), radius, 0.03, **wheel),
             block((-axle - 0.2, -0.06, 0.5 * radius), (crank[0] + 0.1, 0.06, 2 * radius + 0.1),
-                  reflectance=frame, transmission=OPEN),
+                  reflectance=frame, transmission=FRAME_TRANSMISSION),
             rod((axle, 0, radius), (bar[0], 0, bar[1]), 0.04, reflectance=frame),
             rod(crank, (0.85 * bar[0], 0, 0.8 * bar[1]), 0.05, reflectance=frame),
             rod((bar[0], -half_bar, bar[1]), (bar[0], half_bar, bar[1]), 0.018, reflectance=METAL)]
 
 
-def parked_bicycle(rng: np.random.Generator) -> np.ndarray:
+def make_bicycle(rng: np.random.Generator) -> np.ndarray:
     """(P,) PART of a bicycle that stands, with a reflector that shines."""
     length = rng.uniform(1.6, 1.85)
     seat = (-0.15 * length, 0.92)
-    rows = [*_bicycle(length, 0.3, (0.22 * length, 1.02), rng.uniform(0.05, 0.5)),
+    rows = [*_bicycle_parts(length, 0.3, (0.22 * length, 1.02), rng.uniform(0.05, 0.5)),
             part(ELLIPSOID, (seat[0], 0, seat[1]), (0.13, 0.08, 0.05), reflectance=RUBBER),
             block((seat[0] - 0.4, -0.04, 0.68), (seat[0] - 0.38, 0.04, 0.74), reflectance=PLATE)]
     return parts(rows, BICYCLE)
 
 
-def parked_motorcycle(rng: np.random.Generator) -> np.ndarray:
+def make_motorcycle(rng: np.random.Generator) -> np.ndarray:
     """(P,) PART of a motorcycle or scooter that stands."""
     length, paint = rng.uniform(1.8, 2.2), rng.uniform(0.05, 0.5)
     radius = rng.uniform(0.25, 0.31)

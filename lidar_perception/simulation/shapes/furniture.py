@@ -9,15 +9,15 @@ from lidar_perception.simulation.shapes.thing import GLASS, METAL, PLATE, RUBBER
 from lidar_perception.simulation.solids import CYLINDER, ELLIPSOID, part, parts
 
 BUILDING, FENCE, VEGETATION, POLE, SIGN, OTHER = 50, 51, 70, 80, 81, 99
-DEEP = -0.3  # foot of what is fixed, m
+FOOT_M = -0.3  # foot of what is fixed, m
 
 
-def pole(rng: np.random.Generator) -> np.ndarray:
+def make_pole(rng: np.random.Generator) -> np.ndarray:
     """A bare mast of 2.5 to 8 m."""
     return parts([_post(rng.uniform(2.5, 8.0), rng.uniform(0.04, 0.12))], POLE)
 
 
-def lamp(rng: np.random.Generator) -> np.ndarray:
+def make_lamp(rng: np.random.Generator) -> np.ndarray:
     """A street lamp of 4 to 8 m: mast, base with a door, arm to +x, head."""
     height, arm = rng.uniform(4.0, 8.0), rng.uniform(0.4, 1.5)
     return parts([_post(height, 0.06), _post(1.1, 0.09),
@@ -26,7 +26,7 @@ def lamp(rng: np.random.Generator) -> np.ndarray:
                        reflectance=METAL)], POLE)
 
 
-def traffic_light(rng: np.random.Generator) -> np.ndarray:
+def make_traffic_light(rng: np.random.Generator) -> np.ndarray:
     """A mast with lights at 2.2 m, a box with a button, and most often a sign or two below."""
     height, own = rng.uniform(3.0, 3.5), rng.spawn(1)[0]
     rows = [_post(height, 0.07),
@@ -37,7 +37,7 @@ def traffic_light(rng: np.random.Generator) -> np.ndarray:
                          for _ in range(own.integers(3))], POLE)
 
 
-def sign(rng: np.random.Generator) -> np.ndarray:
+def make_sign(rng: np.random.Generator) -> np.ndarray:
     """One or two plates that shine, to +x, on a post; some hang low, as on islands, half of these
     on a mast. Of KITTI's clusters as wide as a person, 15 % shine in part, most of them low."""
     low = rng.uniform(1.7, 2.2) if rng.random() < 0.6 else rng.uniform(0.4, 1.0)
@@ -53,7 +53,7 @@ def _plate(x: float, z: float, half: float) -> tuple:
     return block((x, -half, z), (x + 0.02, half, z + 2 * half), reflectance=PLATE, semantic=SIGN)
 
 
-def fence(rng: np.random.Generator, length: float) -> np.ndarray:
+def make_fence(rng: np.random.Generator, length: float) -> np.ndarray:
     """A fence along x, centred: posts, two rails and bars or boards with gaps, which a beam meets
     the more the flatter it comes."""
     height, x = rng.uniform(0.8, 1.9), length / 2
@@ -66,7 +66,7 @@ def fence(rng: np.random.Generator, length: float) -> np.ndarray:
     return parts(rows, FENCE)
 
 
-def wall(rng: np.random.Generator, length: float) -> np.ndarray:
+def make_wall(rng: np.random.Generator, length: float) -> np.ndarray:
     """A garden wall along x, centred, with a coping and piers at its ends."""
     height, x, tone = rng.uniform(0.5, 2.2), length / 2, rng.uniform(0.3, 0.5)
     rows = [block((-x, -0.12, -0.6), (x, 0.12, height), reflectance=tone),
@@ -76,7 +76,7 @@ def wall(rng: np.random.Generator, length: float) -> np.ndarray:
     return parts(rows, FENCE)
 
 
-def litter_bin(rng: np.random.Generator) -> np.ndarray:
+def make_litter_bin(rng: np.random.Generator) -> np.ndarray:
     """A round bin that stands, or one that hangs on a post."""
     grey = rng.uniform(0.1, 0.5)
     if rng.random() < 0.5:
@@ -88,7 +88,7 @@ def litter_bin(rng: np.random.Generator) -> np.ndarray:
                                           reflectance=grey)], OTHER)
 
 
-def wheelie_bin(rng: np.random.Generator) -> np.ndarray:
+def make_wheelie_bin(rng: np.random.Generator) -> np.ndarray:
     """A bin on two wheels, of 120 l or 1100 l."""
     half, high = ((0.25, 0.24), 0.93) if rng.random() < 0.75 else ((0.55, 0.65), 1.3)
     x, y = half
@@ -97,23 +97,23 @@ def wheelie_bin(rng: np.random.Generator) -> np.ndarray:
                   disc((0.1 - x, 0, 0.1), 0.1, y, reflectance=RUBBER)], OTHER)
 
 
-def bollard(rng: np.random.Generator) -> np.ndarray:
+def make_bollard(rng: np.random.Generator) -> np.ndarray:
     """A bollard of 0.6 to 1.1 m, some with a band that shines."""
     high, radius = rng.uniform(0.6, 1.1), rng.uniform(0.05, 0.14)
-    rows = [_cylinder(DEEP, high, radius, rng.uniform(0.1, 0.5)),
+    rows = [_cylinder(FOOT_M, high, radius, rng.uniform(0.1, 0.5)),
             part(ELLIPSOID, (0, 0, high), (radius, radius, 0.06), reflectance=0.3)]
     if rng.random() < 0.3:
         rows.append(_cylinder(high - 0.2, high - 0.1, radius + 0.003, PLATE))
     return parts(rows, POLE)
 
 
-def beacon(rng: np.random.Generator) -> np.ndarray:
+def make_beacon(rng: np.random.Generator) -> np.ndarray:
     """A post or board of 0.8 to 1.6 m, most of which shines, such as stands on islands and at
     roadworks: narrower than a person, as high, and seen from far. Some have a base or a round
     sign."""
     high, low, half = rng.uniform((0.8, 0.05, 0.06), (1.6, 0.4, 0.3))
     if rng.random() < 0.5:
-        rows = [_cylinder(DEEP, low, 0.8 * half, 0.3), _cylinder(low, high, half, PLATE)]
+        rows = [_cylinder(FOOT_M, low, 0.8 * half, 0.3), _cylinder(low, high, half, PLATE)]
     else:
         rows = [_post(low, 0.04),
                 block((-0.03, -half, low), (0.03, half, high), reflectance=PLATE)]
@@ -125,28 +125,28 @@ def beacon(rng: np.random.Generator) -> np.ndarray:
     return parts(rows, SIGN)
 
 
-def cabinet(rng: np.random.Generator) -> np.ndarray:
+def make_cabinet(rng: np.random.Generator) -> np.ndarray:
     """A cabinet of the telephone or the mains, 0.8 to 1.7 m high."""
     x, y, high = rng.uniform((0.15, 0.2, 0.8), (0.3, 0.8, 1.7))
-    return parts([block((-x, -y, DEEP), (x, y, high), reflectance=rng.uniform(0.2, 0.5)),
+    return parts([block((-x, -y, FOOT_M), (x, y, high), reflectance=rng.uniform(0.2, 0.5)),
                   block((-x - 0.03, -y - 0.03, high), (x + 0.03, y + 0.03, high + 0.05),
                         reflectance=0.35)], OTHER)
 
 
-def bench(rng: np.random.Generator) -> np.ndarray:
+def make_bench(rng: np.random.Generator) -> np.ndarray:
     """A bench with a back, which looks to +x; the seat is 0.45 m high."""
     y = rng.uniform(0.7, 1.0)
     wood = dict(reflectance=rng.uniform(0.2, 0.4))
     rows = [block((-0.22, -y, 0.41), (0.25, y, 0.45), transmission=0.2, **wood),
             block((-0.29, -y, 0.55), (-0.25, y, 0.85), transmission=0.2, **wood)]
-    rows += [block((-0.27, s * y * 0.75, DEEP), (-0.2, s * (y * 0.75 - 0.06), 0.85), **wood)
+    rows += [block((-0.27, s * y * 0.75, FOOT_M), (-0.2, s * (y * 0.75 - 0.06), 0.85), **wood)
              for s in (-1, 1)]
-    rows += [block((0.15, s * y * 0.75, DEEP), (0.22, s * (y * 0.75 - 0.06), 0.42), **wood)
+    rows += [block((0.15, s * y * 0.75, FOOT_M), (0.22, s * (y * 0.75 - 0.06), 0.42), **wood)
              for s in (-1, 1)]
     return parts(rows, OTHER)
 
 
-def shopping_trolley(rng: np.random.Generator) -> np.ndarray:
+def make_shopping_trolley(rng: np.random.Generator) -> np.ndarray:
     """A trolley of a supermarket, whose basket is of wire."""
     rows = [block((-0.4, -0.28, 0.55), (0.45, 0.28, 1.0), reflectance=METAL,
                   density=rng.uniform(0.7, 1.2)),
@@ -159,29 +159,30 @@ def shopping_trolley(rng: np.random.Generator) -> np.ndarray:
     return parts(rows, OTHER)
 
 
-def phone_box(rng: np.random.Generator) -> np.ndarray:
+def make_phone_box(rng: np.random.Generator) -> np.ndarray:
     """Four posts, panes on three sides, a roof and the telephone."""
     half, high = 0.45, rng.uniform(2.2, 2.4)
-    rows = [rod((sx * half, sy * half, DEEP), (sx * half, sy * half, high), 0.04, reflectance=METAL)
-            for sx in (-1, 1) for sy in (-1, 1)]
+    rows = [rod((sx * half, sy * half, FOOT_M), (sx * half, sy * half, high), 0.04,
+                reflectance=METAL) for sx in (-1, 1) for sy in (-1, 1)]
     rows += [block((-half, s * half, 0.3), (half, s * (half - 0.01), high), reflectance=GLASS,
                    transmission=0.7) for s in (-1, 1)]
     rows += [block((-half - 0.05, -half - 0.05, high), (half + 0.05, half + 0.05, high + 0.15),
                    reflectance=0.3),
-             block((-half, -half + 0.05, DEEP), (-half + 0.25, half - 0.05, 1.7), reflectance=0.3)]
+             block((-half, -half + 0.05, FOOT_M), (-half + 0.25, half - 0.05, 1.7),
+                   reflectance=0.3)]
     return parts(rows, OTHER)
 
 
-def advertising_column(rng: np.random.Generator) -> np.ndarray:
+def make_advertising_column(rng: np.random.Generator) -> np.ndarray:
     """A round column with posters, 2.5 to 3.6 m high."""
     high, radius = rng.uniform(2.5, 3.6), rng.uniform(0.5, 0.7)
-    return parts([_cylinder(DEEP, high, radius, rng.uniform(0.3, 0.5)),
+    return parts([_cylinder(FOOT_M, high, radius, rng.uniform(0.3, 0.5)),
                   _cylinder(high, high + 0.15, radius + 0.08, 0.3),
                   part(ELLIPSOID, (0, 0, high + 0.15), (radius, radius, 0.25), reflectance=0.3)],
                  OTHER)
 
 
-def cone(rng: np.random.Generator) -> np.ndarray:
+def make_cone(rng: np.random.Generator) -> np.ndarray:
     """A traffic cone of 0.5 to 0.75 m with a band that shines."""
     high = rng.uniform(0.5, 0.75)
     return parts([block((-0.19, -0.19, 0), (0.19, 0.19, 0.03), reflectance=0.3),
@@ -190,7 +191,7 @@ def cone(rng: np.random.Generator) -> np.ndarray:
                   _cylinder(0.7 * high, high, 0.05, 0.4)], OTHER)
 
 
-def planter(rng: np.random.Generator) -> np.ndarray:
+def make_planter(rng: np.random.Generator) -> np.ndarray:
     """A tub with a plant that is as high as a person."""
     high = rng.uniform(0.35, 0.6)
     tall = rng.uniform(0.35, 0.65)
@@ -199,7 +200,7 @@ def planter(rng: np.random.Generator) -> np.ndarray:
                        semantic=VEGETATION, density=rng.uniform(2, 6))], OTHER)
 
 
-def parasol(rng: np.random.Generator) -> np.ndarray:
+def make_parasol(rng: np.random.Generator) -> np.ndarray:
     """A table of a cafe with two chairs under a parasol."""
     high = rng.uniform(2.1, 2.5)
     rows = [rod((0, 0, 0), (0, 0, high), 0.025, reflectance=METAL),
@@ -213,19 +214,19 @@ def parasol(rng: np.random.Generator) -> np.ndarray:
     return parts(rows, OTHER)
 
 
-def hydrant(rng: np.random.Generator) -> np.ndarray:
+def make_hydrant(rng: np.random.Generator) -> np.ndarray:
     """A pump, hydrant or parking meter: a post with a thicker head."""
     high = rng.uniform(0.9, 1.5)
-    return parts([_cylinder(DEEP, high, rng.uniform(0.04, 0.12), 0.3),
+    return parts([_cylinder(FOOT_M, high, rng.uniform(0.04, 0.12), 0.3),
                   part(ELLIPSOID, (0, 0, high - 0.15), (0.14, 0.17, 0.22),
                        reflectance=rng.uniform(0.1, 0.4))], OTHER)
 
 
-def stairs(rng: np.random.Generator, length: float) -> np.ndarray:
+def make_stairs(rng: np.random.Generator, length: float) -> np.ndarray:
     """Stairs along x, centred, that climb to +y from y = 0, with a landing behind and rails."""
     x, count, rise = length / 2, int(rng.integers(2, 7)), rng.uniform(0.12, 0.17)
     end = 0.3 * count + rng.uniform(0.5, 2.0)
-    rows = [block((-x, 0.3 * i, DEEP), (x, end, rise * (i + 1)), reflectance=0.4)
+    rows = [block((-x, 0.3 * i, FOOT_M), (x, end, rise * (i + 1)), reflectance=0.4)
             for i in range(count)]
     for at in np.linspace(-x + 0.05, x - 0.05, max(2, int(length / 4) + 1)):
         top = (at, 0.3 * count, rise * count + 0.9)
@@ -235,16 +236,16 @@ def stairs(rng: np.random.Generator, length: float) -> np.ndarray:
     return parts(rows, BUILDING)
 
 
-def bicycle_stand(rng: np.random.Generator) -> np.ndarray:
+def make_bicycle_stand(rng: np.random.Generator) -> np.ndarray:
     """A hoop across x to which bicycles are locked."""
     high = rng.uniform(0.7, 0.9)
-    rows = [rod((s * 0.35, 0, DEEP), (s * 0.35, 0, high), 0.025, reflectance=METAL)
+    rows = [rod((s * 0.35, 0, FOOT_M), (s * 0.35, 0, high), 0.025, reflectance=METAL)
             for s in (-1, 1)]
     return parts([*rows, rod((-0.35, 0, high), (0.35, 0, high), 0.025, reflectance=METAL)], POLE)
 
 
 def _post(height: float, radius: float) -> tuple:
-    return _cylinder(DEEP, height, radius, METAL)
+    return _cylinder(FOOT_M, height, radius, METAL)
 
 
 def _cylinder(low: float, high: float, radius: float, reflectance: float) -> tuple:
@@ -253,6 +254,6 @@ def _cylinder(low: float, high: float, radius: float, reflectance: float) -> tup
 
 
 # What a detector may take for a person.
-PERSON_SIZED = (sign, beacon, litter_bin, wheelie_bin, bollard, cabinet, shopping_trolley,
-                phone_box, advertising_column, cone, planter, parasol, hydrant, traffic_light,
-                bench)
+PERSON_SIZED = (make_sign, make_beacon, make_litter_bin, make_wheelie_bin, make_bollard,
+                make_cabinet, make_shopping_trolley, make_phone_box, make_advertising_column,
+                make_cone, make_planter, make_parasol, make_hydrant, make_traffic_light, make_bench)

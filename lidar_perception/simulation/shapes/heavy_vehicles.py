@@ -13,29 +13,29 @@ from lidar_perception.simulation.shapes.thing import (
     block,
     disc,
     draw_size,
-    rigid,
+    make_rigid,
     rod,
     slope,
     upright_pane,
 )
-from lidar_perception.simulation.shapes.vehicles import paint
+from lidar_perception.simulation.shapes.vehicles import draw_paint
 from lidar_perception.simulation.solids import ELLIPSOID, Surface, part, parts
 
 TRUCK, ON_RAILS, OTHER_VEHICLE = 18, 16, 20
 
 
-def truck(rng: np.random.Generator) -> Thing:
+def make_truck(rng: np.random.Generator) -> Thing:
     """A truck with a closed load, or with an open platform whose cab is its highest part."""
     length, width, height = size = draw_size(rng, "Truck")
     open_load = rng.random() < 0.25
     top = rng.uniform(1.6, 2.2) if open_load else height
     cab = height if open_load else min(height, rng.uniform(2.7, 3.1))
-    made = _truck(length, width, top, cab, max(paint(rng), 0.1), rng.uniform(0.2, 0.6))
-    return rigid(made, size, "Truck")
+    made = _truck_parts(length, width, top, cab, max(draw_paint(rng), 0.1), rng.uniform(0.2, 0.6))
+    return make_rigid(made, size, "Truck")
 
 
-def _truck(length: float, width: float, load: float, cab: float, colour: float,
-           cargo: float) -> np.ndarray:
+def _truck_parts(length: float, width: float, load: float, cab: float, colour: float,
+                 cargo: float) -> np.ndarray:
     """load, cab: heights in metres of the load and the cab above the road."""
     x, y, radius, floor = length / 2, width / 2, 0.48, 1.15
     back, belt, roof = x - min(2.2, 0.24 * length), 0.62 * cab, cab - 0.25
@@ -68,22 +68,22 @@ def _truck(length: float, width: float, load: float, cab: float, colour: float,
     return parts(rows, TRUCK)
 
 
-def bus(rng: np.random.Generator) -> Thing:
+def make_bus(rng: np.random.Generator) -> Thing:
     """A city bus of 10.5 to 13 m."""
     size = (rng.uniform(10.5, 13.0), rng.uniform(2.45, 2.55), rng.uniform(2.9, 3.2))
-    made = _coach(size, max(paint(rng), 0.15), OTHER_VEHICLE, 0.5, (2.2 / size[0], 0.78))
-    return rigid(made, size, "Misc")
+    made = _coach_parts(size, max(draw_paint(rng), 0.15), OTHER_VEHICLE, 0.5, (2.2 / size[0], 0.78))
+    return make_rigid(made, size, "Misc")
 
 
-def tram(rng: np.random.Generator) -> Thing:
+def make_tram(rng: np.random.Generator) -> Thing:
     """A tram, or one section of it."""
     size = draw_size(rng, "Tram")
-    made = _coach(size, max(paint(rng), 0.15), ON_RAILS, 0.38, (0.18, 0.82))
-    return rigid(made, size, "Tram")
+    made = _coach_parts(size, max(draw_paint(rng), 0.15), ON_RAILS, 0.38, (0.18, 0.82))
+    return make_rigid(made, size, "Tram")
 
 
-def _coach(size: tuple[float, float, float], colour: float, semantic: int, radius: float,
-           axles: tuple[float, float]) -> np.ndarray:
+def _coach_parts(size: tuple[float, float, float], colour: float, semantic: int, radius: float,
+                 axles: tuple[float, float]) -> np.ndarray:
     """A long body with bands of windows, pillars between them and seats inside; axles: places as
     shares of the length from the tail."""
     length, width, height = size

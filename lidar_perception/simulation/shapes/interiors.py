@@ -5,18 +5,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidar_perception.simulation.shapes.furniture import BUILDING, DEEP, OTHER
+from lidar_perception.simulation.shapes.furniture import BUILDING, FOOT_M, OTHER
 from lidar_perception.simulation.shapes.thing import GLASS, METAL, RUBBER, block, disc, rod
 from lidar_perception.simulation.solids import CYLINDER, part, parts
 
-DOOR = 2.1   # m: height of a door
-THICK = 0.2  # m: of walls
+DOOR_HEIGHT_M = 2.1   # m: height of a door
+WALL_THICKNESS_M = 0.2  # m: of walls
 
 
-def wall(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
+def make_wall(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
     """A wall with a skirting, and now and then a rail, a board or a picture on it."""
     x = length / 2
-    rows = [_panel((-x, x), DEEP, height, rng),
+    rows = [_wall_panel((-x, x), FOOT_M, height, rng),
             block((-x, -0.015, 0.0), (x, 0.0, 0.1), reflectance=rng.uniform(0.1, 0.5))]
     pick = rng.random()
     if pick < 0.15:
@@ -28,68 +28,71 @@ def wall(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
     return parts(rows, BUILDING)
 
 
-def door(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
+def make_door(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
     """A door in its frame; one in three stands open, to a room."""
     x, half = length / 2, min(0.5, 0.45 * length)
-    rows = _around(rng, x, half, DOOR, height)
+    rows = _opening_parts(rng, x, half, DOOR_HEIGHT_M, height)
     tone = rng.uniform(0.15, 0.6)
     if rng.random() < 0.33:
         leaf = half if rng.random() < 0.5 else -half
-        rows += [block((leaf - 0.02, 0.0, 0.0), (leaf + 0.02, 0.9, DOOR), reflectance=tone),
-                 *_room(rng, x + rng.uniform(0.5, 1.5), height)]
+        rows += [block((leaf - 0.02, 0.0, 0.0), (leaf + 0.02, 0.9, DOOR_HEIGHT_M),
+                       reflectance=tone),
+                 *_room_parts(rng, x + rng.uniform(0.5, 1.5), height)]
     else:
-        rows += [block((-half, 0.1, 0.0), (half, 0.15, DOOR), reflectance=tone),
+        rows += [block((-half, 0.1, 0.0), (half, 0.15, DOOR_HEIGHT_M), reflectance=tone),
                  rod((0.8 * half, 0.05, 1.05), (0.6 * half, 0.05, 1.05), 0.015,
                      reflectance=METAL)]
     return parts(rows, BUILDING)
 
 
-def glazing(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
+def make_glazing(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
     """Panes from the floor up between posts, and a room behind."""
-    return parts([*_panes(rng, length, min(height, rng.uniform(2.3, 3.0)), height),
-                  *_room(rng, length / 2, height)], BUILDING)
+    return parts([*_pane_parts(rng, length, min(height, rng.uniform(2.3, 3.0)), height),
+                  *_room_parts(rng, length / 2, height)], BUILDING)
 
 
-def window(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
+def make_window(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
     """Panes from the floor up between posts, with nothing behind."""
-    return parts(_panes(rng, length, height - 0.3, height), BUILDING)
+    return parts(_pane_parts(rng, length, height - 0.3, height), BUILDING)
 
 
-def passage(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
+def make_passage(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
     """Where another corridor leaves."""
     x, far = length / 2, rng.uniform(6.0, 25.0)
-    rows = [block((s * x, 0.0, DEEP), (s * (x + THICK), far, height),
+    rows = [block((s * x, 0.0, FOOT_M), (s * (x + WALL_THICKNESS_M), far, height),
                   reflectance=rng.uniform(0.4, 0.7)) for s in (-1, 1)]
-    rows += [block((-x, far, DEEP), (x, far + THICK, height), reflectance=0.5),
-             block((-x, THICK, height), (x, far, height + THICK), reflectance=0.6)]
+    rows += [block((-x, far, FOOT_M), (x, far + WALL_THICKNESS_M, height), reflectance=0.5),
+             block((-x, WALL_THICKNESS_M, height), (x, far, height + WALL_THICKNESS_M),
+                   reflectance=0.6)]
     return parts(rows, BUILDING)
 
 
-def _panel(x: tuple, low: float, high: float, rng: np.random.Generator) -> tuple:
-    return block((x[0], 0.0, low), (x[1], THICK, high), reflectance=rng.uniform(0.4, 0.75))
+def _wall_panel(x: tuple, low: float, high: float, rng: np.random.Generator) -> tuple:
+    return block((x[0], 0.0, low), (x[1], WALL_THICKNESS_M, high),
+                 reflectance=rng.uniform(0.4, 0.75))
 
 
-def _around(rng, x: float, half: float, top: float, height: float) -> list[tuple]:
+def _opening_parts(rng, x: float, half: float, top: float, height: float) -> list[tuple]:
     """What is left of a wall around an opening."""
     tone = dict(reflectance=rng.uniform(0.4, 0.75))
-    return [block((-x, 0.0, DEEP), (-half, THICK, height), **tone),
-            block((half, 0.0, DEEP), (x, THICK, height), **tone),
-            block((-half, 0.0, top), (half, THICK, height), **tone)]
+    return [block((-x, 0.0, FOOT_M), (-half, WALL_THICKNESS_M, height), **tone),
+            block((half, 0.0, FOOT_M), (x, WALL_THICKNESS_M, height), **tone),
+            block((-half, 0.0, top), (half, WALL_THICKNESS_M, height), **tone)]
 
 
-def _room(rng, x: float, height: float) -> list[tuple]:
+def _room_parts(rng, x: float, height: float) -> list[tuple]:
     """The walls of a room beyond, with something in it."""
     far, tone = rng.uniform(2.5, 6.0), dict(reflectance=rng.uniform(0.4, 0.7))
     wide, deep, high = rng.uniform((0.3, 0.2, 0.7), (0.7, 0.5, 2.0))
     at = rng.uniform(-0.4, 0.4) * x
-    return [block((-x, far, DEEP), (x, far + THICK, height), **tone),
-            *(block((s * x, THICK, DEEP), (s * (x - 0.1), far, height), **tone)
+    return [block((-x, far, FOOT_M), (x, far + WALL_THICKNESS_M, height), **tone),
+            *(block((s * x, WALL_THICKNESS_M, FOOT_M), (s * (x - 0.1), far, height), **tone)
               for s in (-1, 1)),
-            block((-x, THICK, height), (x, far, height + THICK), **tone),
+            block((-x, WALL_THICKNESS_M, height), (x, far, height + WALL_THICKNESS_M), **tone),
             block((at - wide, far - 2 * deep, 0.0), (at + wide, far, high), reflectance=0.3)]
 
 
-def _panes(rng, length: float, top: float, height: float) -> list[tuple]:
+def _pane_parts(rng, length: float, top: float, height: float) -> list[tuple]:
     """A beam goes through the glass, or not; below is a rail, above the wall goes on."""
     x, count = length / 2, max(round(length / rng.uniform(1.2, 2.0)), 1)
     rows = [block((-x, 0.06, 0.05), (x, 0.08, top), reflectance=GLASS,
@@ -98,11 +101,12 @@ def _panes(rng, length: float, top: float, height: float) -> list[tuple]:
     rows += [block((at - 0.03, 0.02, 0.0), (at + 0.03, 0.12, top), reflectance=METAL)
              for at in np.linspace(-x, x, count + 1)]
     if top < height:
-        rows.append(_panel((-x, x), top, height, rng))
+        rows.append(_wall_panel((-x, x), top, height, rng))
     return rows
 
 
-def ceiling(rng: np.random.Generator, length: float, width: float, height: float) -> np.ndarray:
+def make_ceiling(rng: np.random.Generator, length: float, width: float,
+                 height: float) -> np.ndarray:
     """What is above, centred, so high; with lamps, or beams, below it."""
     x, y = length / 2, width / 2
     rows = [block((-x, -y, height), (x, y, height + 0.3), reflectance=rng.uniform(0.4, 0.75))]
@@ -114,16 +118,16 @@ def ceiling(rng: np.random.Generator, length: float, width: float, height: float
     return parts(rows, BUILDING)
 
 
-def column(rng: np.random.Generator, height: float) -> np.ndarray:
+def make_column(rng: np.random.Generator, height: float) -> np.ndarray:
     """A round or a square column up to the ceiling."""
     half, tone = rng.uniform(0.12, 0.4), rng.uniform(0.3, 0.7)
     if rng.random() < 0.5:
         return parts([part(CYLINDER, (0, 0, height / 2), (half, half, height / 2),
                            reflectance=tone)], BUILDING)
-    return parts([block((-half, -half, DEEP), (half, half, height), reflectance=tone)], BUILDING)
+    return parts([block((-half, -half, FOOT_M), (half, half, height), reflectance=tone)], BUILDING)
 
 
-def shelf(rng: np.random.Generator, length: float) -> np.ndarray:
+def make_shelf(rng: np.random.Generator, length: float) -> np.ndarray:
     """A shelf along x, open to both sides, with what lies on its boards."""
     x, y, high = length / 2, rng.uniform(0.2, 0.35), rng.uniform(1.2, 2.2)
     levels = np.arange(0.1, high, rng.uniform(0.35, 0.5))
@@ -136,7 +140,7 @@ def shelf(rng: np.random.Generator, length: float) -> np.ndarray:
     return parts(rows, OTHER)
 
 
-def table(rng: np.random.Generator, length: float, width: float) -> np.ndarray:
+def make_table(rng: np.random.Generator, length: float, width: float) -> np.ndarray:
     """A table, 0.7 to 0.78 m high, on four legs or a foot, at times with something on it."""
     x, y, high = length / 2, width / 2, rng.uniform(0.7, 0.78)
     rows = [block((-x, -y, high - 0.04), (x, y, high), reflectance=rng.uniform(0.2, 0.6))]
@@ -153,7 +157,7 @@ def table(rng: np.random.Generator, length: float, width: float) -> np.ndarray:
     return parts(rows, OTHER)
 
 
-def chair(rng: np.random.Generator) -> np.ndarray:
+def make_chair(rng: np.random.Generator) -> np.ndarray:
     """An empty chair."""
     tone, back = dict(reflectance=rng.uniform(0.1, 0.5)), rng.uniform(0.8, 0.95)
     rows = [block((-0.2, -0.21, 0.42), (0.22, 0.21, 0.46), **tone),
@@ -168,7 +172,7 @@ def chair(rng: np.random.Generator) -> np.ndarray:
     return parts(rows, OTHER)
 
 
-def counter(rng: np.random.Generator) -> np.ndarray:
+def make_counter(rng: np.random.Generator) -> np.ndarray:
     """A counter, which looks to +x."""
     y, high = rng.uniform(1.0, 2.5), rng.uniform(0.95, 1.2)
     return parts([block((-0.35, -y, 0.0), (0.3, y, high), reflectance=rng.uniform(0.2, 0.6)),
@@ -176,7 +180,7 @@ def counter(rng: np.random.Generator) -> np.ndarray:
                  OTHER)
 
 
-def display(rng: np.random.Generator) -> np.ndarray:
+def make_display(rng: np.random.Generator) -> np.ndarray:
     """A board on a foot, as wide and high as a person."""
     y, low, high = rng.uniform((0.2, 0.1, 1.5), (0.5, 0.9, 2.0))
     return parts([block((-0.03, -y, low), (0.03, y, high), reflectance=rng.uniform(0.1, 0.7)),
@@ -184,7 +188,7 @@ def display(rng: np.random.Generator) -> np.ndarray:
                   block((-0.25, -0.8 * y, 0.0), (0.25, 0.8 * y, 0.03), reflectance=METAL)], OTHER)
 
 
-def machine(rng: np.random.Generator) -> np.ndarray:
+def make_machine(rng: np.random.Generator) -> np.ndarray:
     """What sells drinks, or a wardrobe, or a locker."""
     x, y, high = rng.uniform((0.2, 0.25, 1.4), (0.45, 0.6, 2.0))
     return parts([block((-x, -y, 0.0), (x, y, high), reflectance=rng.uniform(0.1, 0.6)),
@@ -192,7 +196,7 @@ def machine(rng: np.random.Generator) -> np.ndarray:
                  OTHER)
 
 
-def boxes(rng: np.random.Generator) -> np.ndarray:
+def make_boxes(rng: np.random.Generator) -> np.ndarray:
     """A pile of two to four boxes."""
     rows, z = [], 0.0
     for x, y, high, turn, tone in rng.random((rng.integers(2, 5), 5)).tolist():
@@ -203,7 +207,7 @@ def boxes(rng: np.random.Generator) -> np.ndarray:
     return parts(rows, OTHER)
 
 
-def coat_stand(rng: np.random.Generator) -> np.ndarray:
+def make_coat_stand(rng: np.random.Generator) -> np.ndarray:
     """A post with what hangs on it."""
     high, wide, low = rng.uniform((1.6, 0.12, 0.5), (1.85, 0.25, 1.1))
     return parts([rod((0, 0, 0), (0, 0, high), 0.025, reflectance=METAL),
@@ -213,7 +217,7 @@ def coat_stand(rng: np.random.Generator) -> np.ndarray:
                        reflectance=rng.uniform(0.1, 0.5))], OTHER)
 
 
-def cart(rng: np.random.Generator) -> np.ndarray:
+def make_cart(rng: np.random.Generator) -> np.ndarray:
     """A cart for cleaning, mail or trays."""
     x, y, high = rng.uniform((0.3, 0.22, 0.8), (0.5, 0.3, 1.5))
     rows = [block((-x, -y, z), (x, y, z + 0.04), reflectance=METAL)
@@ -228,4 +232,4 @@ def cart(rng: np.random.Generator) -> np.ndarray:
 
 
 # What a detector may take for a person.
-PERSON_SIZED = (display, machine, boxes, coat_stand, cart, chair)
+PERSON_SIZED = (make_display, make_machine, make_boxes, make_coat_stand, make_cart, make_chair)

@@ -17,16 +17,16 @@ from lidar_perception.simulation.shapes.thing import (
     block,
     disc,
     draw_size,
-    rigid,
+    make_rigid,
     rod,
 )
-from lidar_perception.simulation.solids import BOX, ELLIPSOID, hull, part, parts
+from lidar_perception.simulation.solids import BOX, ELLIPSOID, compute_hull, part, parts
 
 PERSON, OTHER = 30, 99
 CARRIED = ("", "backpack", "bag", "umbrella", "trolley", "pram")
 
 STANCE = 0.54  # share of a stride for which a foot is on the ground; real walkers: 0.6
-SHORTEST = 0.3  # shortest box as a share of the height, in KITTI
+MIN_LENGTH_SHARE = 0.3  # shortest box as a share of the height, in KITTI
 HEEL_OFF = 0.6  # share of the stance after which the heel rises
 # Lengths as shares of the height, after Drillis and Contini (1966); radii with clothes.
 THIGH, SHANK, ANKLE, FOOT, SHOULDER, UPPER_ARM, FOREARM = (0.245, 0.246, 0.039, 0.152, 0.818,
@@ -35,7 +35,7 @@ REACH = 0.99 * (THIGH + SHANK)
 HIP = REACH + ANKLE
 
 
-class Build(NamedTuple):
+class PersonBuild(NamedTuple):
     """A person. step: metres from one footfall to the next, 0 stands; phase: share of a stride at
     the start; shift: metres that the hips are ahead of the origin; hair, coat, trousers:
     reflectances; carried: one of CARRIED."""
@@ -51,8 +51,8 @@ class Build(NamedTuple):
     shift: float = 0.0
 
 
-def pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
-               carried: str = "") -> Thing:
+def make_pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
+                    carried: str = "") -> Thing:
     """Someone who walks at speed m/s, or stands. The length of the box is what the body covers
     over a whole stride, without a bag, umbrella, trolley or pram, but not below SHORTEST.
 
@@ -64,36 +64,37 @@ def pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
         shrink = rng.uniform(0.62, 0.8)
         width, height = width * max(shrink, 0.7), height * shrink
     step = min(sqrt(60 * 0.0065 * abs(speed)) * height / 1.72, 0.5 * height)
-    build = Build(height, max(width, 0.27 * height), step, rng.uniform(), rng.uniform(0.03, 0.3),
-                  rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75), carried)
-    low, high = _covered(build)
+    build = PersonBuild(height, max(width, 0.27 * height), step, rng.uniform(),
+                        rng.uniform(0.03, 0.3), rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75),
+                        carried)
+    low, high = _measure_stride(build)
     build = build._replace(shift=-(low + high) / 2)
-    size = (max(high - low, SHORTEST * height), build.width, height)
-    return Thing(partial(walker, build=build), size, CLASSES[PEDESTRIAN])
+    size = (max(high - low, MIN_LENGTH_SHARE * height), build.width, height)
+    return Thing(partial(pose_walker, build=build), size, CLASSES[PEDESTRIAN])
 
 
-def _covered(build: Build) -> tuple[float, float]:
+def _measure_stride(build: PersonBuild) -> tuple[float, float]:
     """The least and largest x over a stride; both halves of it are alike."""
     body = build._replace(carried="backpack" if build.carried == "backpack" else "", phase=0.0)
-    poses = [_limbs(i / 24, body) for i in range(12 if build.step else 1)]
-    rows = [row for limbs, _ in poses for row in limbs] + _trunk(body, 0.0)
-    low, _, _, high, _, _ = hull(parts(rows, PERSON))
+    poses = [_limb_parts(i / 24, body) for i in range(12 if build.step else 1)]
+    rows = [row for limbs, _ in poses for row in limbs] + _trunk_parts(body, 0.0)
+    low, _, _, high, _, _ = compute_hull(parts(rows, PERSON))
     return low, high
 
 
-def walker(travelled: float, build: Build) -> np.ndarray:
+def pose_walker(travelled: float, build: PersonBuild) -> np.ndarray:
     """(P,) PART of a walker after so many metres; the last two rows before what is carried are the
     feet, right and left. A foot on the ground stays where it is, and the hips sink as far as the
     legs spread, so that the height is the box's when a leg is upright below the hips."""
     turns = build.phase + (travelled / (2 * build.step) if build.step else 0.0)
-    limbs, up = _limbs(turns, build)
-    trunk = _trunk(build, up)
+    limbs, up = _limb_parts(turns, build)
+    trunk = _trunk_parts(build, up)
     made = parts(trunk[:5] + limbs + trunk[5:], PERSON)
     made["centre"][:, 0] += build.shift
     return made
 
 
-def _trunk(build: Build, up: float) -> list[tuple]:
+def _trunk_parts(build: PersonBuild, up: float) -> list[tuple]:
     """Head, neck, chest and hips, and what is carried, so much higher than at rest."""
     h, w = build.height, build.width
     return [
@@ -106,20 +107,20 @@ def _trunk(build: Build, up: float) -> list[tuple]:
              reflectance=build.coat),
         part(ELLIPSOID, (0, 0, 0.54 * h + up), (0.075 * h, min(0.105 * h, 0.38 * w), 0.11 * h),
              reflectance=build.trousers),
-        *_load(build.carried, h, w, up, build.coat)]
+        *_load_parts(build.carried, h, w, up, build.coat)]
 
 
-def _limbs(turns: float, build: Build) -> tuple[list[tuple], float]:
+def _limb_parts(turns: float, build: PersonBuild) -> tuple[list[tuple], float]:
     """Arms, legs and feet after so many strides, and how much higher than at rest the hips are."""
     h = build.height
-    feet = [_foot((turns + half) % 1.0, 2 * build.step, h) for half in (0.0, 0.5)]
+    feet = [_pose_foot((turns + half) % 1.0, 2 * build.step, h) for half in (0.0, 0.5)]
     hip = min(HIP * h, *(z + sqrt((REACH * h) ** 2 - min(0.88 * abs(x), 0.9 * REACH * h) ** 2)
                          for _, _, (x, z) in feet))
     up, rows = hip - HIP * h, []
     for side, (u, left) in zip((-1, 1), ((turns + 0.5, False), (turns, True))):
-        rows += _arm(side, u, build, up, left)
+        rows += _arm_parts(side, u, build, up, left)
     for side, (_, _, ankle) in zip((-1, 1), feet):
-        rows += _leg(side, ankle, hip, h, build.trousers)
+        rows += _leg_parts(side, ankle, hip, h, build.trousers)
     for side, (toe, tilt, _) in zip((-1, 1), feet):
         flat, steep, half = cos(tilt), sin(tilt), FOOT * h / 2
         rows.append(part(BOX, (toe[0] - half * flat + 0.02 * h * steep, side * 0.055 * h,
@@ -128,7 +129,7 @@ def _limbs(turns: float, build: Build) -> tuple[list[tuple], float]:
     return rows, up
 
 
-def _foot(u: float, stride: float, h: float) -> tuple[tuple, float, tuple]:
+def _pose_foot(u: float, stride: float, h: float) -> tuple[tuple, float, tuple]:
     """The tip of the sole (x, z), the tilt of the foot (heel up) and the ankle (x, z) at share u
     of a stride, in metres from the hips and the ground. It stands from u = 0 to STANCE."""
     most = 0.6 * min(stride / (0.8 * h), 1.0)
@@ -148,17 +149,17 @@ def _foot(u: float, stride: float, h: float) -> tuple[tuple, float, tuple]:
     return toe, tilt, ankle
 
 
-def _leg(side: int, ankle: tuple, hip: float, h: float, trousers: float) -> list[tuple]:
+def _leg_parts(side: int, ankle: tuple, hip: float, h: float, trousers: float) -> list[tuple]:
     """Thigh and shank; the knee bends forward as far as the ankle is near. The pelvis turns with
     the legs."""
     start = (0.12 * ankle[0], hip)
-    x, z = knee(start, ankle, THIGH * h, SHANK * h)
+    x, z = find_knee(start, ankle, THIGH * h, SHANK * h)
     y = side * 0.055 * h
     return [rod((start[0], y, hip), (x, y, z), 0.05 * h, reflectance=trousers),
             rod((x, y, z), (ankle[0], y, ankle[1]), 0.037 * h, reflectance=trousers)]
 
 
-def knee(hip: tuple, ankle: tuple, thigh: float, shank: float) -> tuple[float, float]:
+def find_knee(hip: tuple, ankle: tuple, thigh: float, shank: float) -> tuple[float, float]:
     """Where the knee is (x, z) between a hip and an ankle (x, z)."""
     x, z = ankle[0] - hip[0], ankle[1] - hip[1]
     far = hypot(x, z)
@@ -169,7 +170,7 @@ def knee(hip: tuple, ankle: tuple, thigh: float, shank: float) -> tuple[float, f
     return hip[0] + along * x - bend * z, hip[1] + along * z + bend * x
 
 
-def _arm(side: int, u: float, build: Build, up: float, left: bool) -> list[tuple]:
+def _arm_parts(side: int, u: float, build: PersonBuild, up: float, left: bool) -> list[tuple]:
     """Upper arm and forearm, which swings with the other leg, or holds what is carried. The
     forearm reaches the width of the box."""
     h, w, coat = build.height, build.width, build.coat
@@ -189,7 +190,7 @@ def _arm(side: int, u: float, build: Build, up: float, left: bool) -> list[tuple
             rod(elbow, hand, radius, reflectance=coat)]
 
 
-def _load(carried: str, h: float, w: float, up: float, coat: float) -> list[tuple]:
+def _load_parts(carried: str, h: float, w: float, up: float, coat: float) -> list[tuple]:
     """What somebody carries, pulls or pushes; bag and trolley on the right."""
     if carried == "backpack":
         return [part(ELLIPSOID, (-0.1 * h, 0, 0.7 * h + up), (0.07 * h, 0.085 * h, 0.13 * h),
@@ -222,7 +223,7 @@ def _load(carried: str, h: float, w: float, up: float, coat: float) -> list[tupl
     return []
 
 
-def sitting(rng: np.random.Generator, chair: bool = True) -> Thing:
+def make_sitting_person(rng: np.random.Generator, chair: bool = True) -> Thing:
     """Someone who sits, knees and feet ahead; without a chair they need a bench below them, whose
     seat is 0.45 m high. The box holds the person and the chair."""
     length, width, height = size = draw_size(rng, "Person_sitting")
@@ -256,4 +257,4 @@ def sitting(rng: np.random.Generator, chair: bool = True) -> Thing:
     else:
         rows.append(part(ELLIPSOID, (back + 0.1, 0, seat + 0.45 * trunk), (0.1, 0.1, 0.2),
                          reflectance=coat))
-    return rigid(parts(rows, PERSON), size, "Person_sitting")
+    return make_rigid(parts(rows, PERSON), size, "Person_sitting")

@@ -38,12 +38,12 @@ class Thing(NamedTuple):
     label: str
 
 
-def rigid(made: np.ndarray, size: tuple[float, float, float], label: str) -> Thing:
+def make_rigid(made: np.ndarray, size: tuple[float, float, float], label: str) -> Thing:
     """A thing whose parts are the same wherever it is."""
-    return Thing(partial(_same, made), size, label)
+    return Thing(partial(_return_parts, made), size, label)
 
 
-def _same(made: np.ndarray, travelled: float) -> np.ndarray:
+def _return_parts(made: np.ndarray, travelled: float) -> np.ndarray:
     return made
 
 
@@ -57,7 +57,7 @@ def draw_size(rng: np.random.Generator, label: str) -> tuple[float, float, float
     return float(length), float(width), float(height)
 
 
-def between(share: float, low: float, high: float) -> float:
+def interpolate(share: float, low: float, high: float) -> float:
     """What rng.uniform(low, high) gives where rng.random() gives share: many numbers drawn at once
     take a tenth of the time."""
     return low + (high - low) * share
@@ -67,7 +67,7 @@ def rod(start: tuple, end: tuple, radius: float, **surface) -> tuple:
     """A cylinder from start to end (x, y, z)."""
     x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     level = hypot(x, y)
-    return part(CYLINDER, _middle(start, end), (radius, radius, hypot(level, z) / 2),
+    return part(CYLINDER, _midpoint(start, end), (radius, radius, hypot(level, z) / 2),
                 yaw=atan2(y, x), pitch=atan2(level, z), **surface)
 
 
@@ -80,11 +80,11 @@ def disc(centre: tuple, radius: float, half_width: float, **surface) -> tuple:
 def block(corner: tuple, opposite: tuple, **surface) -> tuple:
     """An upright box between two corners (x, y, z)."""
     (a, b, c), (x, y, z) = corner, opposite
-    return part(BOX, _middle(corner, opposite), (abs(x - a) / 2, abs(y - b) / 2, abs(z - c) / 2),
+    return part(BOX, _midpoint(corner, opposite), (abs(x - a) / 2, abs(y - b) / 2, abs(z - c) / 2),
                 **surface)
 
 
-def _middle(one: tuple, other: tuple) -> tuple:
+def _midpoint(one: tuple, other: tuple) -> tuple:
     return (one[0] + other[0]) / 2, (one[1] + other[1]) / 2, (one[2] + other[2]) / 2
 
 

@@ -6,7 +6,7 @@ from math import cos, pi, sin
 
 import numpy as np
 
-from lidar_perception.simulation.shapes.thing import between, rod
+from lidar_perception.simulation.shapes.thing import interpolate, rod
 from lidar_perception.simulation.solids import BOX, ELLIPSOID, part, parts
 
 VEGETATION, TRUNK = 70, 71
@@ -14,7 +14,7 @@ BARK, LEAVES = 0.31, 0.34  # medians of trunk and vegetation in a scan of Semant
 WOOD = {"reflectance": BARK, "semantic": TRUNK}
 
 
-def tree(rng: np.random.Generator, height: float | None = None) -> np.ndarray:
+def make_tree(rng: np.random.Generator, height: float | None = None) -> np.ndarray:
     """(P,) PART of a broad-leaved tree so many metres high, drawn if not given: a trunk, three
     boughs, a crown and three tufts, none below a third of the height. Its foot is 0.3 m in the
     ground."""
@@ -28,54 +28,58 @@ def tree(rng: np.random.Generator, height: float | None = None) -> np.ndarray:
         end = (spread * cos(at), spread * sin(at), 0.62 * height)
         rows.append(rod((0, 0, fork), end, 0.4 * radius, **WOOD))
     wide, tall = height * rng.uniform(0.2, 0.3), height - fork
-    leaves = [_foliage(rng, (0, 0, fork + 0.55 * tall), (wide, wide, 0.45 * tall), (0.4, 1.0))]
+    leaves = [_draw_foliage(rng, (0, 0, fork + 0.55 * tall), (wide, wide, 0.45 * tall), (0.4, 1.0))]
     for i, (a, b, c, up, *rest) in enumerate(rng.random((3, 7)).tolist()):
         at = turn + 1.0 + 2.1 * i
-        centre = 0.7 * wide * cos(at), 0.7 * wide * sin(at), fork + tall * between(up, 0.25, 0.7)
-        half = (height * between(a, 0.12, 0.2), height * between(b, 0.12, 0.2),
-                height * between(c, 0.1, 0.16))
-        leaves.append(_leaves(rest, centre, half, (0.6, 2.0)))
+        centre = (0.7 * wide * cos(at), 0.7 * wide * sin(at),
+                  fork + tall * interpolate(up, 0.25, 0.7))
+        half = (height * interpolate(a, 0.12, 0.2), height * interpolate(b, 0.12, 0.2),
+                height * interpolate(c, 0.1, 0.16))
+        leaves.append(_leaf_ball(rest, centre, half, (0.6, 2.0)))
     return parts(rows + leaves, VEGETATION)
 
 
-def conifer(rng: np.random.Generator) -> np.ndarray:
+def make_conifer(rng: np.random.Generator) -> np.ndarray:
     """(P,) PART of a conifer with boughs down to the ground."""
     height = rng.uniform(2.5, 9.0)
     stem = rod((0, 0, -0.3), (0, 0, 0.8 * height), 0.015 * height, **WOOD)
     tall = 0.2 * height
-    rows = [_foliage(rng, (0, 0, max(z * height, tall + 0.1)), (r * height, r * height, tall),
-                     (1.0, 2.0)) for z, r in ((0.2, 0.2), (0.4, 0.16), (0.6, 0.11), (0.8, 0.06))]
+    rows = [_draw_foliage(rng, (0, 0, max(z * height, tall + 0.1)), (r * height, r * height, tall),
+                          (1.0, 2.0))
+            for z, r in ((0.2, 0.2), (0.4, 0.16), (0.6, 0.11), (0.8, 0.06))]
     return parts([stem, *rows], VEGETATION)
 
 
-def bush(rng: np.random.Generator) -> np.ndarray:
+def make_bush(rng: np.random.Generator) -> np.ndarray:
     """(P,) PART of a bush, 0.6 to 2 m high: three overlapping balls of leaves."""
     high = rng.uniform(0.3, 1.0)
     rows = []
     for x, y, a, b, c, *rest in rng.random((3, 8)).tolist():
-        half = high * between(a, 0.6, 1.1), high * between(b, 0.6, 1.1), high * between(c, 0.8, 1.2)
-        rows.append(_leaves(rest, ((x - 0.5) * high, (y - 0.5) * high, 0.8 * high), half,
-                            (1.5, 5.0)))
+        half = (high * interpolate(a, 0.6, 1.1), high * interpolate(b, 0.6, 1.1),
+                high * interpolate(c, 0.8, 1.2))
+        rows.append(_leaf_ball(rest, ((x - 0.5) * high, (y - 0.5) * high, 0.8 * high), half,
+                               (1.5, 5.0)))
     return parts(rows, VEGETATION)
 
 
-def hedge(rng: np.random.Generator, length: float) -> np.ndarray:
+def make_hedge(rng: np.random.Generator, length: float) -> np.ndarray:
     """(P,) PART of a hedge so long along x, centred, with an uneven top; its foot is 0.3 m in the
     ground."""
     height, half = rng.uniform(0.8, 2.0), rng.uniform(0.25, 0.5)
     rows = [part(BOX, (0, 0, height / 2 - 0.15), (length / 2, half, height / 2 + 0.15),
                  reflectance=LEAVES, density=rng.uniform(4, 10))]
-    rows += [_foliage(rng, (x, 0, height), (length / 8, 1.1 * half, rng.uniform(0.08, 0.2)),
-                      (2, 6)) for x in np.linspace(-0.38, 0.38, 4) * length]
+    rows += [_draw_foliage(rng, (x, 0, height), (length / 8, 1.1 * half, rng.uniform(0.08, 0.2)),
+                           (2, 6)) for x in np.linspace(-0.38, 0.38, 4) * length]
     return parts(rows, VEGETATION)
 
 
-def _foliage(rng: np.random.Generator, centre: tuple, half: tuple, density: tuple) -> tuple:
-    return _leaves(rng.random(3).tolist(), centre, half, density)
+def _draw_foliage(rng: np.random.Generator, centre: tuple, half: tuple, density: tuple) -> tuple:
+    return _leaf_ball(rng.random(3).tolist(), centre, half, density)
 
 
-def _leaves(drawn: list[float], centre: tuple, half: tuple, density: tuple) -> tuple:
+def _leaf_ball(drawn: list[float], centre: tuple, half: tuple, density: tuple) -> tuple:
     """A ball of leaves; drawn: three numbers 0 .. 1 for its yaw, reflectance and density."""
     turn, tone, thick = drawn
     return part(ELLIPSOID, centre, half, yaw=turn * pi,
-                reflectance=LEAVES * between(tone, 0.8, 1.25), density=between(thick, *density))
+                reflectance=LEAVES * interpolate(tone, 0.8, 1.25),
+                density=interpolate(thick, *density))

@@ -16,7 +16,7 @@ from lidar_perception.simulation.shapes.thing import (
     block,
     disc,
     draw_size,
-    rigid,
+    make_rigid,
     rod,
     slope,
     upright_pane,
@@ -69,7 +69,7 @@ MINIBUS = Style(0.85, 0.70, 0.03, 0.01, 0.52, 0.56)
 PANEL_VAN = Style(0.85, 0.70, 0.03, 0.01, 0.52, 0.56, 0.55)
 
 
-def car(rng: np.random.Generator, driver: bool = True) -> Thing:
+def make_car(rng: np.random.Generator, driver: bool = True) -> Thing:
     """A car of random size, body and paint. driver: whether someone sits in it."""
     size = draw_size(rng, CLASSES[CAR_ID])
     if size[2] > 1.62:
@@ -78,26 +78,27 @@ def car(rng: np.random.Generator, driver: bool = True) -> Thing:
         style = (SEDAN, SEDAN, ESTATE)[rng.integers(3)]
     else:
         style = (HATCHBACK, HATCHBACK, HATCHBACK, ESTATE, SEDAN)[rng.integers(5)]
-    return rigid(_mottled(body(size, style, paint(rng), rng.uniform(0.6, 0.92), driver), rng),
-                 size, CLASSES[CAR_ID])
+    made = make_body(size, style, draw_paint(rng), rng.uniform(0.6, 0.92), driver)
+    return make_rigid(_vary_reflectance(made, rng), size, CLASSES[CAR_ID])
 
 
-def van(rng: np.random.Generator, driver: bool = True) -> Thing:
+def make_van(rng: np.random.Generator, driver: bool = True) -> Thing:
     """A minibus or a panel van of random size and paint."""
     size = draw_size(rng, "Van")
     style = PANEL_VAN if rng.random() < 0.6 else MINIBUS
-    coat = max(paint(rng), paint(rng))
-    return rigid(_mottled(body(size, style, coat, rng.uniform(0.6, 0.9), driver), rng), size, "Van")
+    coat = max(draw_paint(rng), draw_paint(rng))
+    made = make_body(size, style, coat, rng.uniform(0.6, 0.9), driver)
+    return make_rigid(_vary_reflectance(made, rng), size, "Van")
 
 
-def paint(rng: np.random.Generator) -> float:
+def draw_paint(rng: np.random.Generator) -> float:
     """The reflectance of a coat of paint. Half of all points on KITTI's cars are below 0.03 and a
     tenth is above 0.4: dark paint throws the beam away. Yet dark cars are seen at 40 m."""
     dark, middle, light = (0.02, 0.05), (0.04, 0.35), (0.25, 0.6)
     return float(rng.uniform(*(dark, middle, light)[rng.choice(3, p=(0.5, 0.25, 0.25))]))
 
 
-def _mottled(solids: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _vary_reflectance(solids: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """The same with parts brighter and darker than others, as lacquer on KITTI's cars is. Nothing
     is drawn from rng itself: streets stay as they are, whatever their cars are made of."""
     factor = rng.spawn(1)[0].lognormal(0.0, MOTTLE, len(solids))
@@ -106,8 +107,8 @@ def _mottled(solids: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return solids
 
 
-def body(size: tuple[float, float, float], style: Style, colour: float, glass: float,
-         driver: bool = True) -> np.ndarray:
+def make_body(size: tuple[float, float, float], style: Style, colour: float, glass: float,
+              driver: bool = True) -> np.ndarray:
     """(P,) PART. size: length, width, height in metres, without the mirrors; colour: reflectance;
     glass: share of the beams that pass a pane. Below the belt are door panels, boxes over the
     axles and a floor with sills between the wheels."""
@@ -126,14 +127,14 @@ def body(size: tuple[float, float, float], style: Style, colour: float, glass: f
     pane = Surface(reflectance=GLASS, transmission=glass)
     rows = [
         block((rear, -0.98 * y, clear), (front, 0.98 * y, arch), **shell),
-        *_bonnet((low, bonnet), x, 0.97 * y, height, shell),
+        *_bonnet_parts((low, bonnet), x, 0.97 * y, height, shell),
         block((TAIL - x, -TAIL_FLAT * y, TAIL_LOW * height), (load, TAIL_FLAT * y, deck - 0.02),
               **shell),
         block((TAIL + TAIL_ROUND - x, -TAIL_SIDE * y, clear), (load, TAIL_SIDE * y, deck - 0.02),
               **shell),
-        *_corners(TAIL - x, y, (TAIL_LOW * height, deck - 0.02), shell),
-        _bumper(x, 0.97 * y, height, shell),
-        _bumper(-x, 0.97 * y, height, shell),
+        *_corner_parts(TAIL - x, y, (TAIL_LOW * height, deck - 0.02), shell),
+        _bumper_part(x, 0.97 * y, height, shell),
+        _bumper_part(-x, 0.97 * y, height, shell),
         block((roof, -narrow, height - 0.13), (high, narrow, height - DOME), **shell),
         part(ELLIPSOID, ((roof + high) / 2, 0.0, height - DOME), ((high - roof) / 2, narrow, DOME),
              reflectance=0.25 * colour),
@@ -160,20 +161,20 @@ def body(size: tuple[float, float, float], style: Style, colour: float, glass: f
         block((x - 0.05, -0.26, plate - 0.055), (x, 0.26, plate + 0.055), reflectance=PLATE),
         block((TAIL - 0.02 - x, -0.26, 0.4 * height), (TAIL - x, 0.26, 0.4 * height + 0.11),
               reflectance=PLATE),
-        *_corners(TAIL - 0.005 - x, y + 0.005, (0.38 * height, 0.44 * height),
-                  Surface(reflectance=LIGHTS))]
-    rows += _seats(0.5 * (low + high) - 0.75, load, 0.75 * y, arch, 0.45 * belt + 0.55 * top,
-                   driver)
+        *_corner_parts(TAIL - 0.005 - x, y + 0.005, (0.38 * height, 0.44 * height),
+                       Surface(reflectance=LIGHTS))]
+    rows += _seat_parts(0.5 * (low + high) - 0.75, load, 0.75 * y, arch, 0.45 * belt + 0.55 * top,
+                        driver)
     return parts(rows, CAR)
 
 
-def _bumper(x: float, y: float, height: float, surface: Surface) -> tuple:
+def _bumper_part(x: float, y: float, height: float, surface: Surface) -> tuple:
     """What reaches x in its middle, rounded seen from above and from the side."""
     return part(ELLIPSOID, (x - copysign(0.5, x), 0.0, BUMPER * height), (0.5, y, 0.17 * height),
                 **surface)
 
 
-def _corners(x: float, y: float, heights: tuple, surface: Surface) -> list[tuple]:
+def _corner_parts(x: float, y: float, heights: tuple, surface: Surface) -> list[tuple]:
     """The two corners of a tail at x, round seen from above, between two heights."""
     low, high = heights
     return [part(CYLINDER, (x + TAIL_ROUND, side * TAIL_FLAT * y, (low + high) / 2),
@@ -181,7 +182,7 @@ def _corners(x: float, y: float, heights: tuple, surface: Surface) -> list[tuple
             for side in (-1, 1)]
 
 
-def _bonnet(foot: tuple, x: float, y: float, height: float, surface: Surface) -> list[tuple]:
+def _bonnet_parts(foot: tuple, x: float, y: float, height: float, surface: Surface) -> list[tuple]:
     """A bonnet and its crown, from the foot (x, z) of the windscreen down to the nose at x. At its
     edge is a step of 0.2 m down; the crown is 0.04 of the height above the foot."""
     low, top = foot
@@ -190,7 +191,8 @@ def _bonnet(foot: tuple, x: float, y: float, height: float, surface: Surface) ->
                  **surface)]
 
 
-def _seats(x: float, rear: float, y: float, low: float, high: float, driver: bool) -> list[tuple]:
+def _seat_parts(x: float, rear: float, y: float, low: float, high: float,
+                driver: bool) -> list[tuple]:
     """Backs of the front seats at x, of the bench ahead of rear if there is room, the driver.
     Most beams end on none of them: what comes back through two panes is weak. On KITTI's cars seen
     from behind, 2 % of the points are where the bench is, with these 1 to 2 %."""

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import overload
 
 from lidar_perception.data.frame import BOXES, CAMERA, POSES, Frame, Recording
-from lidar_perception.simulation.camera import FORWARD_CAMERA, labels_around, labels_in_view
-from lidar_perception.simulation.drive import longest_drive, scan_at
-from lidar_perception.simulation.scene import ANY, Scenes
+from lidar_perception.simulation.camera import FORWARD_CAMERA, select_labels, select_labels_in_view
+from lidar_perception.simulation.drive import longest_drive, simulate_scan
+from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 
-GAP_NS = 10 * 10**9  # between the drives through two scenes, as between KITTI's recordings
+DRIVE_GAP_NS = 10 * 10**9  # between the drives through two scenes, as between KITTI's recordings
 
 
 class SimulatedFrames(Sequence[Frame]):
@@ -24,7 +24,7 @@ class SimulatedFrames(Sequence[Frame]):
     """
 
     def __init__(self, seed: int, frames: int, sensor: Sensor = HDL64E,
-                 frames_per_drive: int | None = None, scenes: Scenes = ANY) -> None:
+                 frames_per_drive: int | None = None, scenes: Scenes = ALL_STREETS) -> None:
         """Each of the scenes seed, seed + 1, ... has frames_per_drive frames, by default as many
         as fit into a drive."""
         self._seed, self._frames, self._sensor, self._scenes = seed, frames, sensor, scenes
@@ -44,25 +44,25 @@ class SimulatedFrames(Sequence[Frame]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         number = range(len(self))[index]
-        camera, labels = ((FORWARD_CAMERA, labels_in_view) if self._has_camera else
-                          (None, labels_around))
+        camera, labels = ((FORWARD_CAMERA, select_labels_in_view) if self._has_camera else
+                          (None, select_labels))
         scene, moment = divmod(number, self._per_drive)
-        drive_ns = GAP_NS + round(self._per_drive * 10**9 / self._sensor.rate)
-        scan = scan_at(self._seed + scene, moment, self._sensor, self._scenes)
+        drive_ns = DRIVE_GAP_NS + round(self._per_drive * 10**9 / self._sensor.rate)
+        scan = simulate_scan(self._seed + scene, moment, self._sensor, self._scenes)
         frame = replace(scan.frame, stamp_ns=scan.frame.stamp_ns + scene * drive_ns)
         return Frame.of(f"{scene:04}/{moment:06}", frame, labels(scan.truth), camera,
                         pose=scan.pose.copy, sequence=f"{scene:04}", index=moment,
                         sensor_height=self._sensor.height)
 
 
-def simulated_scans(seed: int, frames: int, sensor: Sensor = HDL64E,
-                    streets_of: int | None = None, scenes: Scenes = ANY) -> Iterator[Frame]:
+def simulate_frames(seed: int, frames: int, sensor: Sensor = HDL64E,
+                    streets_of: int | None = None, scenes: Scenes = ALL_STREETS) -> Iterator[Frame]:
     """Yield the frames of SimulatedFrames, with streets_of frames of each scene."""
     yield from SimulatedFrames(seed, frames, sensor, streets_of, scenes)
 
 
-def simulated_recording(seed: int, frames: int, sensor: Sensor = HDL64E,
-                        scenes: Scenes = ANY) -> Recording:
+def simulate_recording(seed: int, frames: int, sensor: Sensor = HDL64E,
+                       scenes: Scenes = ALL_STREETS) -> Recording:
     """Return simulated drives as a recording that no file holds."""
     has = {BOXES, POSES} | ({CAMERA} if scenes.camera else set())
     return Recording(Path("simulation"), f"simulated {scenes.scene}",

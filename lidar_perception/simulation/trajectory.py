@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-SECONDS = 20.0  # for so long nobody walks or drives into anything
-ROBOT = 0.35    # m: radius of a robot that drives on no road
+DRIVE_SECONDS = 20.0  # for so long nobody walks or drives into anything
+ROBOT_RADIUS_M = 0.35    # m: radius of a robot that drives on no road
 
 
-class Along(NamedTuple):
+class TrajectoryPoint(NamedTuple):
     """Where a way is at a time: x, y (world, m), heading (rad), velocity (2,) in the world (m/s)
     and yaw_rate (rad/s, counter-clockwise)."""
 
@@ -22,14 +22,14 @@ class Along(NamedTuple):
     yaw_rate: float
 
 
-class Way(NamedTuple):
+class Trajectory(NamedTuple):
     """x = speed * t, y = the sum of reach * sin(rate * t + phase) over the sways: m, rad/s, rad; so
     that heading, velocity and yaw rate are its exact derivatives. Without sways it is straight."""
 
     speed: float = 0.0
     sways: tuple[tuple[float, float, float], ...] = ()
 
-    def at(self, t: float) -> Along:
+    def at(self, t: float) -> TrajectoryPoint:
         """Where it is after t seconds."""
         y = aside = turning = 0.0
         for reach, rate, phase in self.sways:
@@ -38,8 +38,8 @@ class Way(NamedTuple):
             turning -= reach * rate * rate * sin
         square = self.speed ** 2 + aside ** 2
         yaw_rate = self.speed * turning / square if square else 0.0
-        return Along(self.speed * t, y, math.atan2(aside, self.speed), (self.speed, aside),
-                     yaw_rate)
+        return TrajectoryPoint(self.speed * t, y, math.atan2(aside, self.speed),
+                               (self.speed, aside), yaw_rate)
 
     def sampled(self, seconds: float, step: float) -> np.ndarray:
         """(T, 3) float64 rows [t x y] every step seconds from 0 to seconds, both included."""
@@ -47,14 +47,14 @@ class Way(NamedTuple):
         return np.array([(t, *self.at(t)[:2]) for t in times])
 
 
-def swaying(rng: np.random.Generator, speed: tuple[float, float], stands: float,
-            turn: float) -> Way:
+def draw_trajectory(rng: np.random.Generator, speed: tuple[float, float], stands: float,
+                    turn: float) -> Trajectory:
     """A way at a speed drawn from that range, m/s, that stands with that probability, else turns up
     to so far to both sides, rad, in 8 to 25 s."""
     if rng.random() < stands:
-        return Way()
+        return Trajectory()
     pace, long = rng.uniform(*speed), 2 * np.pi / rng.uniform((8.0, 15.0), (15.0, 25.0))
     # One sway turns atan(reach * rate / speed) at most; two share the angle.
     reach = 0.5 * pace * np.tan(turn * rng.uniform(0.3, 1.0, 2)) / long
     phase = rng.uniform(-np.pi, np.pi, 2)
-    return Way(float(pace), tuple(zip(reach.tolist(), long.tolist(), phase.tolist())))
+    return Trajectory(float(pace), tuple(zip(reach.tolist(), long.tolist(), phase.tolist())))

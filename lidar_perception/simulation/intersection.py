@@ -12,14 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from lidar_perception.simulation.foliage import through_leaves
-from lidar_perception.simulation.hashing import uniform
+from lidar_perception.simulation.foliage import trace_foliage
+from lidar_perception.simulation.hashing import hash_uniform
 from lidar_perception.simulation.sensor import Motion
 from lidar_perception.simulation.solids import BOX, CYLINDER, ELLIPSOID, Solids
-from lidar_perception.simulation.terrain import shine
+from lidar_perception.simulation.terrain import compute_brightness
 
 
-class Shapes(NamedTuple):
+class CompiledSolids(NamedTuple):
     """P solids for compiled code. matrix (P, 3, 3): to the unit shape; offset (P, 3): where that
     takes the frame's origin; drift (P, 3): what it takes the sensor's velocity against the solid
     to. plant (P,) uint64: of the leaves; salt (P,) uint64: of random numbers. The rest as in
@@ -38,14 +38,14 @@ class Shapes(NamedTuple):
     salt: np.ndarray
 
 
-def shapes_of(solids: Solids, motion: Motion, salt: np.uint64) -> Shapes:
+def compile_solids(solids: Solids, motion: Motion, salt: np.uint64) -> CompiledSolids:
     """Solids in the sensor's frame at the stamp; salt: of the scan."""
     matrix = np.swapaxes(solids.axes, 1, 2) / solids.half[:, :, None]
     slides = np.asarray(motion.velocity, np.float64) - solids.velocity
     # Copies, as compiled code is compiled anew for arrays that are read-only or lie otherwise.
     density, transmission, reflectance = (np.array(part, np.float64) for part in (
         solids.density, solids.transmission, solids.reflectance))
-    return Shapes(
+    return CompiledSolids(
         np.array(matrix, order="C"), -np.einsum("pij,pj->pi", matrix, solids.centre),
         np.einsum("pij,pj->pi", matrix, slides), np.array(solids.kind), density, transmission,
         reflectance, reflectance.view(np.uint64), np.array(solids.owner), np.array(solids.semantic),
@@ -53,7 +53,7 @@ def shapes_of(solids: Solids, motion: Motion, salt: np.uint64) -> Shapes:
 
 
 @njit(cache=True, nogil=True)
-def unit_ray(shapes, s, way, since, lift):
+def to_unit_frame(shapes, s, way, since, lift):
     """Start and direction (x, y, z) of a ray in the frame of unit shape s; since: seconds after the
     stamp; lift: of its start over the sensor's origin, m."""
     m, o, v = shapes.matrix[s], shapes.offset[s], shapes.drift[s]
@@ -66,7 +66,7 @@ def unit_ray(shapes, s, way, since, lift):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def span(kind, start, way):
+def intersect_shape(kind, start, way):
     """Ranges at which a ray enters and leaves a unit shape; (inf, -inf) where it misses. A ray
     exactly along a cylinder or on the face of a box is taken as a miss."""
     enter, leave = -np.inf, np.inf
@@ -93,7 +93,7 @@ def span(kind, start, way):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def stop(shapes, s, start, way, enter, leave, number, filled):
+def find_stop_range(shapes, s, start, way, enter, leave, number, filled):
     """Range at which a ray that passes through the shape of solid s is stopped; inf where it is
     not, as when it starts within an opaque one. number: of the ray; filled: see foliage.py."""
     t = enter if enter > 0 else np.inf
@@ -103,24 +103,24 @@ def stop(shapes, s, start, way, enter, leave, number, filled):
         half = (1 / math.sqrt(m[0, 0] ** 2 + m[0, 1] ** 2 + m[0, 2] ** 2),
                 1 / math.sqrt(m[1, 0] ** 2 + m[1, 1] ** 2 + m[1, 2] ** 2),
                 1 / math.sqrt(m[2, 0] ** 2 + m[2, 1] ** 2 + m[2, 2] ** 2))
-        t = through_leaves(start, way, half, enter, leave, shapes.density[s], shapes.plant[s], key,
-                           filled)
-    if shapes.transmission[s] > 0 and uniform(2, key) < shapes.transmission[s]:
+        t = trace_foliage(start, way, half, enter, leave, shapes.density[s], shapes.plant[s], key,
+                          filled)
+    if shapes.transmission[s] > 0 and hash_uniform(2, key) < shapes.transmission[s]:
         return np.inf
     return t
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def shade(shapes, s, way, since, lift, number):
+def shade_hit(shapes, s, way, since, lift, number):
     """Brightness and cosine of the incidence of a ray that ends on solid s."""
     reflectance = shapes.reflectance[s]
     if shapes.density[s] < np.inf:
         # Leaves face anywhere: so much the neighbours of vegetation's points differ on
         # SemanticKITTI.
-        scatter = uniform(6, shapes.salt[s] + np.uint64(number))
-        return shine(reflectance, 0.5) * (0.5 + scatter), 1.0
-    start, along = unit_ray(shapes, s, way, since, lift)
-    enter, _ = span(shapes.kind[s], start, along)
+        scatter = hash_uniform(6, shapes.salt[s] + np.uint64(number))
+        return compute_brightness(reflectance, 0.5) * (0.5 + scatter), 1.0
+    start, along = to_unit_frame(shapes, s, way, since, lift)
+    enter, _ = intersect_shape(shapes.kind[s], start, along)
     x, y, z = _normal(shapes.kind[s], start[0] + enter * along[0], start[1] + enter * along[1],
                       start[2] + enter * along[2])
     m = shapes.matrix[s]
@@ -128,7 +128,7 @@ def shade(shapes, s, way, since, lift, number):
            m[0, 2] * x + m[1, 2] * y + m[2, 2] * z)
     cosine = abs(out[0] * way[0] + out[1] * way[1] + out[2] * way[2]) / math.sqrt(
         out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
-    return shine(reflectance, cosine), cosine
+    return compute_brightness(reflectance, cosine), cosine
 
 
 @njit(cache=True, nogil=True)
