@@ -1,6 +1,7 @@
-"""Make the scores of weights probabilities: fit the lines in their headers to scans of streets that
-they were not trained on. Weights, and the order of the scores, stay as they are, and so does a file
-some of whose classes have too few objects in the scans for a line.
+"""Calibrate the scores of weights to probabilities, on scans that they were not trained on.
+
+The lines in the headers are fitted; the weights and the order of the scores stay. A file stays
+unchanged if one of its classes has too few objects in the scans.
 
     lidar-perception simulate --format kitti --frames 360 --people 2.5 --seed 700000 --out scans
     python scripts/calibrate_weights.py scans v4.safetensors pointnet.safetensors
@@ -25,32 +26,32 @@ from lidar_perception.scoring.kitti.reliability import lines
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.scoring.run import fill
 
-LEAST = 0.02  # score of the boxes that count
+MIN_COUNTED_SCORE = 0.02
 
 
-def uncalibrated(weights: Path) -> NetworkDetector:
-    """The detector of a checkpoint with its network's own scores."""
+def load_uncalibrated(weights: Path) -> NetworkDetector:
+    """Return the detector of a checkpoint with its network's own scores."""
     detector = open_detector(weights, "cpu")
     assert isinstance(detector, NetworkDetector)
-    return detector.with_raw_scores().with_min_score(LEAST)
+    return detector.with_raw_scores().with_min_score(MIN_COUNTED_SCORE)
 
 
 @click.command()
 @click.argument("scans", type=click.Path(exists=True, path_type=Path))
 @click.argument("weights", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @click.option("--jobs", default=1)
-@click.option("--limit", type=int, help="Only so many scans.")
+@click.option("--limit", type=int, help="Largest number of scans.")
 def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -> None:
     """Calibrate checkpoints, in place."""
     for path in weights:
         report = DetectionReport()
         fill(report, open_recording(scans),
-             by_detector(partial(uncalibrated, path)), jobs=jobs, limit=limit)
+             by_detector(partial(load_uncalibrated, path)), jobs=jobs, limit=limit)
         found = lines(Comparison.of(report.frames)) if report.frames else {}
         header = read_header(path)
         if lost := sorted({*header.calibration} - {*found}):
-            raise click.ClickException(f"{path} stays as it is: {scans} has too few "
-                                       f"{', '.join(lost)} that are found, or wrongly found")
+            raise click.ClickException(f"{path} stays unchanged: {scans} has too few correct "
+                                       f"or wrong detections of {', '.join(lost)}")
         save_header(path, replace(header, calibration=found))
         console.print(f"{path.name}: {found}")
 

@@ -1,5 +1,6 @@
-"""Fit candidates/confidence.json to simulated scans: two additive models of log-odds, one from the
-shape of a cluster, one from its likeness to a seed, too.
+"""Fit candidates/confidence.json to simulated scans: two additive models of log-odds.
+
+One uses the shape of a cluster, the other also its similarity to a seed.
 
     lidar-perception simulate --format kitti --frames 400 --people 2 --seed 6000 --out scans
     python scripts/fit_confidence.py scans
@@ -33,21 +34,24 @@ from lidar_perception.training.curves import fit_curves
 from lidar_perception.types import PEDESTRIAN, InputError
 
 KITTI_RANGES = np.array([2093, 1771, 468, 118, 37])  # paper A, Table 1
-RISING = {"similarity": 1, "height_difference_m": -1}  # more likeness is never less likely
+RISING = {"similarity": 1, "height_difference_m": -1}  # more similarity never lowers the confidence
 OUT = Path(module.__file__).with_name("confidence.json")
 
 
-def pedestrians(frame: Frame) -> np.ndarray:
-    """(P, 7) the labelled boxes of a simulated scan."""
+def select_pedestrians(frame: Frame) -> np.ndarray:
+    """Return the labelled boxes (P, 7) of a simulated scan."""
     truth = frame.truth()
     assert truth is not None
     return truth.of_class(PEDESTRIAN)
 
 
-def samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | None:
-    """Features of the clusters of one frame, against a seed of another frame, as one's own cluster
-    says nothing; hit (K,) bool; bins of range of the clusters and of the pedestrians."""
-    truth = pedestrians(frame)
+def collect_samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | None:
+    """Return features of the clusters of a frame, compared with a seed of another frame.
+
+    Also hit (K,) bool, and range bins of the clusters and of the pedestrians. None without
+    clusters. A seed from the same frame would carry no information.
+    """
+    truth = select_pedestrians(frame)
     segmented = segment_cloud(frame.load(), frame.camera(), params)
     boxes, ids = segmented.boxes, np.arange(1, len(segmented.boxes) + 1)
     if len(boxes) == 0:
@@ -64,29 +68,31 @@ def samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | None:
             "bins": range_bins(boxes), "truth": range_bins(truth)}
 
 
-def seed_of(job: tuple[str, int]) -> Seed | None:
-    """The nearest pedestrian of a frame, as in the paper's protocol."""
+def find_seed(job: tuple[str, int]) -> Seed | None:
+    """Return the nearest pedestrian of a frame, as in the paper's protocol."""
     frame = open_recording(job[0]).frames[job[1]]
     try:
         segmented = segment_cloud(frame.load(), frame.camera(), BEST)
-        return make_truth_source(pedestrians(frame))(segmented)
+        return make_truth_source(select_pedestrians(frame))(segmented)
     except InputError:
         return None
 
 
-def work(job: tuple[tuple[str, int], Seed]) -> dict | None:
-    """samples() of one frame, in a process of its own."""
+def run_job(job: tuple[tuple[str, int], Seed]) -> dict | None:
+    """Collect the samples of one frame in a worker process."""
     (root, number), seed = job
-    return samples(open_recording(root).frames[number], seed, BEST)
+    return collect_samples(open_recording(root).frames[number], seed, BEST)
 
 
 def main(roots: list[str]) -> None:
+    """Fit and write both models."""
     jobs = [(root, i) for root in roots for i in range(len(open_recording(root).frames))]
     with Pool() as pool:
-        seeds = pool.map(seed_of, jobs, chunksize=8)
+        seeds = pool.map(find_seed, jobs, chunksize=8)
         others = [next(s for s in seeds[i + 1:] + seeds[:i + 1] if s is not None)
                   for i in range(len(seeds))]
-        frames = [s for s in pool.map(work, list(zip(jobs, others)), chunksize=8) if s is not None]
+        results = pool.map(run_job, list(zip(jobs, others)), chunksize=8)
+        frames = [result for result in results if result is not None]
     features = {name: np.concatenate([f["features"][name] for f in frames])
                 for name in (*SHAPE_KNOTS, *SEED_KNOTS)}
     hit, bins = (np.concatenate([f[name] for f in frames]) for name in ("hit", "bins"))

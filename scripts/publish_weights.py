@@ -1,11 +1,11 @@
-"""Put trained weights into the package: as float16, with a model card beside them.
+"""Add trained weights to the package, as float16 and with a model card.
 
     lidar-perception simulate --format kitti --frames 500 --seed 9000 --out simulated
     python scripts/publish_weights.py v4/best.safetensors simulated /data/kitti/object
     python scripts/publish_weights.py v4/best.safetensors --mean-with before.safetensors simulated
 
-The card says what the weights were trained on and how they score on each folder, of which none
-may have been trained on.
+The card has the training data and the scores on each folder, none of which may have been used for
+training.
 """
 
 from __future__ import annotations
@@ -43,30 +43,31 @@ ROWS = (("bev_relaxed", "from above"), ("bev", "from above"), ("3d_relaxed", "in
         ("3d", "in space"))
 
 
-def scores_of(weights: Path, folder: Path) -> dict[str, Any]:
-    """What evaluate detection finds, as JSON."""
+def evaluate_weights(weights: Path, folder: Path) -> dict[str, Any]:
+    """Return the results of `evaluate detection` as JSON data."""
     report = DetectionReport()
     open_ = partial(open_detector, weights, min_score=MIN_SCORE)
     fill(report, open_recording(folder), by_detector(open_))
     return report.compute()
 
 
-def card(header: checkpoint.Header, title: str, scored: dict[str, dict[str, Any]]) -> str:
-    """The model card, Markdown."""
-    said = header.training
+def format_card(header: checkpoint.Header, title: str, scored: dict[str, dict[str, Any]]) -> str:
+    """Return the model card as Markdown."""
+    training = header.training
+    init = training.get("init")
+    start = f", begun with {Path(init).parent.name}/{Path(init).name}" if init else ""
     lines = [
         f"# {title}", "",
         f"- Network: {header.network}, {' '.join(header.config.classes)}; every field of its "
         "config is in the file's header.",
-        f"- Trained on: {', '.join(said['data'])}, {said['scenes']} scenes; validated on "
-        f"{said['validation_scenes']} others." + (" No real scan was trained on."
-                                                  if said["data"] == ["sim"] else ""),
-        f"- Steps: {said['steps']} of {said['batch']} scenes, {said['seconds'] / 60:.0f} minutes, "
-        f"seed {said['seed']}" + (f", begun with {Path(said['init']).parent.name}/"
-                                  f"{Path(said['init']).name}" if said.get("init") else "") + ".",
+        f"- Trained on: {', '.join(training['data'])}, {training['scenes']} scenes; validated on "
+        f"{training['validation_scenes']} others."
+        + (" No real scan was trained on." if training["data"] == ["sim"] else ""),
+        f"- Steps: {training['steps']} of {training['batch']} scenes, "
+        f"{training['seconds'] / 60:.0f} minutes, seed {training['seed']}{start}.",
         f"- Commit: {header.commit}.",
         *(f"- The mean of these weights and of earlier ones, {other['steps']} steps at commit "
-          f"{other['commit']}." for other in said.get("mean_with", ())),
+          f"{other['commit']}." for other in training.get("mean_with", ())),
         "- Stored as float16.", ""]
     for name, content in scored.items():
         lines += [f"## {name}: {content['frames']} frames", "",
@@ -115,11 +116,11 @@ def main(weights: Path, folders: tuple[Path, ...], before: Path | None, judge: b
         out = WEIGHTS / f"pointpillars_{header.config.version}_{header.config.size}.safetensors"
     out.parent.mkdir(exist_ok=True)
     save_checkpoint(out, network, header, half=True)
-    scored = {folder.name: scores_of(out, folder) for folder in folders}
-    if before is not None:  # the header has what the first folder says of the mean
+    scored = {folder.name: evaluate_weights(out, folder) for folder in folders}
+    if before is not None:  # the header has the metrics of the mean on the first folder
         metrics = select_metrics(scored[folders[0].name], "bev", header.config.classes)
         save_checkpoint(out, network, replace(header, metrics=round_metrics(metrics)), half=True)
-    write_text(out.with_suffix(".md"), card(header, out.stem, scored))
+    write_text(out.with_suffix(".md"), format_card(header, out.stem, scored))
     console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB")
 
 

@@ -59,7 +59,7 @@ def main(arguments: list[str]) -> int:
 
 
 class BackgroundCommand:
-    """A Python command in the background, whose output is printed when it has ended."""
+    """A Python command in the background; its output is printed when it has ended."""
 
     def __init__(self, *words: str, environment: dict[str, str] | None = None):
         self.output = tempfile.TemporaryFile("w+")
@@ -67,7 +67,7 @@ class BackgroundCommand:
                                         stdout=self.output, stderr=subprocess.STDOUT)
 
     def failed(self) -> bool:
-        """Wait for its end; return True if it failed."""
+        """Wait for the end; return True if the command failed."""
         code = self.process.wait()
         self.output.seek(0)
         print(self.output.read(), end="", flush=True)
@@ -75,8 +75,10 @@ class BackgroundCommand:
 
 
 def run_everything(folder: Path) -> list[str]:
-    """Run all checks and tests and return the names of those that failed. folder: for the files of
-    the coverage measurement."""
+    """Run all checks and tests, and return the names of those that failed.
+
+    folder: for the files of the coverage measurement.
+    """
     default_to_one_thread()  # as many processes as cores
     environment = {**os.environ, "COVERAGE_FILE": str(folder / "coverage")}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # compiled once, not in each process
@@ -108,8 +110,11 @@ def run_everything(folder: Path) -> list[str]:
 
 
 def _distributed(workers: int) -> tuple[str, ...]:
-    """Return the options of pytest for this many processes. Whole files are distributed in their
-    order; sorted by their number of tests the slowest would come last."""
+    """Return the options of pytest for this many processes.
+
+    Whole files are distributed in their order; sorted by number of tests, the slowest would end up
+    last.
+    """
     return "-n", str(workers), "--dist", "loadfile", "--no-loadscope-reorder"
 
 

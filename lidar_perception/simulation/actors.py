@@ -1,4 +1,4 @@
-"""Who is in a scene: looks, straight ways, and room that nobody shares."""
+"""Actors of a scene: things that move along straight lines and never collide."""
 
 from __future__ import annotations
 
@@ -14,21 +14,24 @@ from lidar_perception.simulation.shapes.thing import Thing, make_rigid
 from lidar_perception.simulation.solids import compute_hull
 from lidar_perception.simulation.trajectory import Trajectory
 
-HEAD_ROOM_M = 2.2  # parts that hang higher block nobody
+HEAD_ROOM_M = 2.2  # higher parts do not block anyone
 SIGHT_M, FAR_SIGHT_M = 80.0, 120.0  # farther things are left out of a moment; the latter for
 LARGE_M = 5.0                       # things of this size
 STEP_S = 0.1  # between the positions of a robot that others keep clear of
 
 
 def make_prop(made: np.ndarray) -> Thing:
-    """A thing without a label, of parts (P,) PART."""
+    """Return a thing without a label, of parts (P,) PART."""
     return make_rigid(made, (0.0, 0.0, 0.0), "")
 
 
 @dataclass(frozen=True)
 class Actor:
-    """Something at x, y (world, time 0). It moves straight ahead at speed m/s from start to stop,
-    in seconds, and stands before and after. What has no label is a thing with size (0, 0, 0)."""
+    """A thing at x, y in the world at time 0, in m.
+
+    It moves straight ahead at speed (m/s) from start to stop (s), and stands before and after.
+    Things without a label have size (0, 0, 0).
+    """
 
     thing: Thing
     x: float
@@ -40,7 +43,7 @@ class Actor:
 
     @cached_property
     def footprint(self) -> np.ndarray:
-        """(8,) float64, see below; holds the box of a walker, which covers all poses."""
+        """Footprint (8,) float64, see below; for walkers it contains the box of all poses."""
         x0, y0, _, x1, y1, _ = compute_hull(self.thing.parts(0.0), HEAD_ROOM_M)
         length, width, _ = self.thing.size
         x0, x1 = min(x0, -length / 2), max(x1, length / 2)
@@ -53,12 +56,12 @@ class Actor:
 
 
 # A footprint is a row [x y heading, half length, half width, speed, start, stop]: the rectangle
-# around what of an actor is below HEAD_ROOM, x y its centre at time 0.
+# around the parts of an actor below HEAD_ROOM_M, with its centre x y at time 0.
 X, Y, HEADING, LENGTH, WIDTH, SPEED, START, STOP = range(8)
 
 
 def compute_centres(footprints: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """(M, T, 2) centres of footprints (M, 8) at times t (M, T) or (T,)."""
+    """Return centres (M, T, 2) of footprints (M, 8) at times t (M, T) or (T,)."""
     f = footprints[:, None]
     way = f[..., SPEED] * np.clip(t - f[..., START], 0.0, f[..., STOP] - f[..., START])
     return np.stack([f[..., X] + np.cos(f[..., HEADING]) * way,
@@ -67,7 +70,7 @@ def compute_centres(footprints: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def _touches_any(one, many, reach, seconds, gap):
-    """Whether one meets any of many; reach (M,): of these, see _reach."""
+    """Return True if one touches any of many; reach (M,): _max_reach of these."""
     far = _max_reach(one, seconds) + gap
     for m in range(len(many)):
         x, y, near = many[m, X] - one[X], many[m, Y] - one[Y], far + reach[m]
@@ -79,24 +82,26 @@ def _touches_any(one, many, reach, seconds, gap):
 
 @njit(cache=True, nogil=True)
 def _max_reach(one, seconds):
-    """How far from its first place any of a footprint ever gets."""
+    """Return the largest distance from its first centre that a footprint ever reaches."""
     return math.hypot(one[LENGTH], one[WIDTH]) + one[SPEED] * seconds
 
 
 @njit(cache=True, nogil=True)
 def footprints_touch(one, other, seconds, gap):
-    """Whether two footprints (8,) come within gap metres of each other at any time in 0 .. seconds.
-    Exact for gap 0: convex shapes that slide along straight lines touch while their shadows on the
-    normals of all sides do."""
+    """Return True if two footprints (8,) ever come within gap metres in 0 .. seconds.
+
+    Exact for gap 0: convex shapes that slide along straight lines touch while their projections on
+    the normals of all sides do.
+    """
     times = np.empty(6)
     times[:] = (one[START], one[STOP], other[START], other[STOP], 0.0, seconds)
     for i in range(6):
         times[i] = min(max(times[i], 0.0), seconds)
     times.sort()
-    for i in range(5):  # straight in between
+    for i in range(5):  # motion is straight between these times
         x, y = _compute_offset(one, other, times[i])
         next_x, next_y = _compute_offset(one, other, times[i + 1])
-        enter, leave = 0.0, 1.0  # shares of this piece
+        enter, leave = 0.0, 1.0  # shares of this interval
         for side in range(4):
             angle = (one if side < 2 else other)[HEADING] + side % 2 * np.pi / 2
             cos, sin = math.cos(angle), math.sin(angle)
@@ -119,7 +124,7 @@ def footprints_touch(one, other, seconds, gap):
 
 @njit(cache=True, nogil=True)
 def _compute_offset(one, other, t):
-    """From the centre of one to that of the other at time t."""
+    """Return the vector from the centre of one to that of the other at time t."""
     way = one[SPEED] * min(max(t - one[START], 0.0), one[STOP] - one[START])
     other_way = other[SPEED] * min(max(t - other[START], 0.0), other[STOP] - other[START])
     return (other[X] + math.cos(other[HEADING]) * other_way
@@ -130,8 +135,10 @@ def _compute_offset(one, other, t):
 
 @njit(cache=True, nogil=True)
 def _touches_trajectory(one, way, radius):
-    """Whether a footprint (8,) comes within radius of a way (T, 3), [t x y]; as both move between
-    the times of the way, half of what they cover in a step is added."""
+    """Return True if a footprint (8,) comes within radius of a trajectory (T, 3), [t x y].
+
+    Both move between the samples, so half the distance of a step is added.
+    """
     cos, sin = math.cos(one[HEADING]), math.sin(one[HEADING])
     for k in range(len(way)):
         t, last = way[k, 0], way[max(k - 1, 0)]
@@ -146,12 +153,18 @@ def _touches_trajectory(one, way, radius):
 
 
 class Room:
-    """The actors of a scene so far; a newcomer must keep clear of all of them all the time."""
+    """The actors of a scene so far; new ones must never touch them."""
 
     def __init__(self, seconds: float, keep_clear: np.ndarray | None = None,
                  way: Trajectory | None = None, radius: float = 0.0):
-        """keep_clear (M, 8): footprints that are taken from the start; way: of a round robot of
-        that radius, m."""
+        """Start without actors.
+
+        Args:
+            seconds: Duration of the drive.
+            keep_clear: (M, 8) footprints to keep clear of.
+            way: Trajectory of a round robot; None without one.
+            radius: Radius of the robot, m.
+        """
         self.seconds = seconds
         self._way = np.empty((0, 3)) if way is None else way.sampled(seconds, STEP_S)
         self._radius = radius
@@ -161,8 +174,8 @@ class Room:
             self._take(row)
 
     def admit(self, *group: Actor, gap: float = 0.1) -> bool:
-        """Adds the group if none of it ever comes within gap of anyone else, the robot too, nor
-        meets another of its own."""
+        """Add a group if it never comes within gap of other actors or the robot, or touches itself.
+        """
         before = self._used
         for actor in group:
             row, own = actor.footprint, slice(before, self._used)
@@ -176,13 +189,13 @@ class Room:
         return True
 
     def add(self, *group: Actor) -> None:
-        """Adds a group unasked, such as people on a bench."""
+        """Add a group without a check, such as people on a bench."""
         self.actors += group
         for actor in group:
             self._take(actor.footprint)
 
     def _take(self, row: np.ndarray) -> None:
-        if self._used == len(self._taken):  # room for twice as many
+        if self._used == len(self._taken):  # double the capacity
             self._taken, self._reach = np.tile(self._taken, (2, 1)), np.tile(self._reach, 2)
         self._taken[self._used], self._reach[self._used] = row, _max_reach(row, self.seconds)
         self._used += 1

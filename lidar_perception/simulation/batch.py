@@ -1,4 +1,4 @@
-"""Simulated scans as tensors, without a file in between."""
+"""Simulated scans as tensors, without files."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ from lidar_perception.simulation.sensor import HDL64E, Sensor
 
 def generate_training_scans(seed: int = 0, sensor: Sensor = HDL64E,
                             scenes: Scenes = ALL_STREETS) -> Iterator[dict[str, torch.Tensor]]:
-    """Without end: the first scan of the scenes seed, seed + 1, ..., with all their labels.
+    """Yield the first scan of the scenes seed, seed + 1, ..., with all labels, without end.
 
-    points (N, 4) float32 [x y z intensity], boxes (K, 7) float32 and class_ids (K,) int64 as in
-    GroundTruth, num_points (K,) int64. In worker w of n of a DataLoader: every nth scene from
-    seed + w on, so that the workers together give each scene once.
+    In worker w of n of a DataLoader it yields every nth scene from seed + w on, so that the workers
+    together yield each scene once.
+
+    Yields:
+        points (N, 4) float32 [x y z intensity], boxes (K, 7) float32 and class_ids (K,) int64 as in
+        GroundTruth, and num_points (K,) int64.
     """
     worker = torch.utils.data.get_worker_info()
     first, step = (worker.id, worker.num_workers) if worker else (0, 1)

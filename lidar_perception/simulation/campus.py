@@ -1,5 +1,4 @@
-"""Outside, where no cars drive or few and slowly: forecourts, squares and paths around the way of a
-robot."""
+"""Campus scenes with no or slow cars: forecourts, squares and paths around a robot's trajectory."""
 
 from __future__ import annotations
 
@@ -25,19 +24,22 @@ from lidar_perception.simulation.trajectory import (
     draw_trajectory,
 )
 
-SHOULDER_M = 0.6  # m that benches and lamps stand beside a path
+SHOULDER_M = 0.6  # from a path to benches and lamps
 
 
 @dataclass(frozen=True)
 class CampusKind:
-    """Ranges (low, high) are drawn from uniformly; lengths in metres; shares and chances are in
-    0 .. 1. What comes first is laid out around the way of the robot."""
+    """A kind of campus.
 
-    share: float                    # how often it is drawn
-    left: tuple[float, float]       # from the way to what lines the court
+    Ranges (low, high) are drawn from uniformly. Lengths are in m, shares and chances 0 .. 1. The
+    court is laid out around the trajectory of the robot.
+    """
+
+    share: float                    # of the scenes
+    left: tuple[float, float]       # from the trajectory to what lines the court
     right: tuple[float, float]
-    fronts: dict[str, float]        # that (FRONTS and HERE), and how often
-    turn: float                     # how far the robot turns to both sides at most, rad
+    fronts: dict[str, float]        # weights of these, see FRONTS and CAMPUS_FRONTS
+    turn: float                     # largest heading of the robot to both sides, rad
     lane: float = 0.0               # chance of a lane for cars to the right
     path: bool = False              # a path through grass
     things: float = 0.5             # on 100 square metres
@@ -48,7 +50,7 @@ class CampusKind:
     across: float = 0.0             # groups who walk anywhere, on 100 square metres
     standers: float = 8.0           # groups who stand, on 100 m
     riders: float = 3.0             # cyclists on 100 m
-    ends: tuple[float, float] = (25.0, 60.0)  # court behind and ahead of the way
+    ends: tuple[float, float] = (25.0, 60.0)  # of the court behind and ahead of the trajectory
     stands: float = 0.15            # chance that the robot stands
     speed: tuple[float, float] = (0.5, 1.5)
 
@@ -68,7 +70,7 @@ CAMPUS_KINDS = {
 
 def make_campus(rng: np.random.Generator, kind: CampusKind,
                 people: float) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
-    """A court, what lines it, stands and moves in it, and a robot's way through it."""
+    """Make a court with its surroundings, things and people, and a robot's trajectory."""
     way = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
     court = Court.around(way.sampled(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2),
                          np.array([rng.uniform(*kind.right), rng.uniform(*kind.left)]))
@@ -108,7 +110,7 @@ def make_campus(rng: np.random.Generator, kind: CampusKind,
 
 
 def _draw_ground(rng, kind: CampusKind, court: Court, lane: float) -> Ground:
-    """Pavement, with a lane beyond its edge, or a path through grass. Grass is mown."""
+    """Draw pavement, with a lane beyond its edge, or a path through mown grass."""
     slopes = np.tan(np.radians(rng.normal(0.0, 0.7, 2))).tolist()
     look = dict(slope_x=slopes[0], slope_y=slopes[1], wave=rng.uniform(0.0, 0.06),
                 wavelength=rng.uniform(15, 40), road=rng.uniform(0.23, 0.38),
@@ -124,7 +126,7 @@ def _draw_ground(rng, kind: CampusKind, court: Court, lane: float) -> Ground:
 
 
 def _build_entrance(rng, side: Side) -> Iterator[Actor]:
-    """A hall behind glass with stairs before it, between houses or trees."""
+    """Yield glass halls with stairs in front, between houses or trees."""
     along, line = rng.uniform(0, 8), side.walk + 2.5
     while along < side.length - 8:
         long = min(rng.uniform(12, 35), side.length - along)
@@ -141,7 +143,7 @@ def _build_entrance(rng, side: Side) -> Iterator[Actor]:
 
 
 def _build_hedge(rng, side: Side) -> Iterator[Actor]:
-    """A hedge or a low wall beside the way with gaps, and a lawn with trees behind."""
+    """Yield a hedge or low wall with gaps, and a lawn with trees behind."""
     along, line = 0.0, side.walk + rng.uniform(1.0, 2.5)
     made = (vegetation.make_hedge, vegetation.make_hedge, furniture.make_wall)[rng.integers(3)]
     while along < side.length - 4:
@@ -155,7 +157,7 @@ CAMPUS_FRONTS = {"entrance": _build_entrance, "hedge": _build_hedge}
 
 
 def _fill_lane(rng, side: Side, lane: float) -> Iterator[Actor]:
-    """Cars that wait at the kerb, and one or two that drive slowly."""
+    """Yield cars that wait at the kerb, and a few that drive slowly."""
     for along in scatter(rng, side.length, 5.0):
         make = make_car if rng.random() < 0.75 else make_van
         thing = make(rng, driver=bool(rng.random() < 0.5))
@@ -166,7 +168,7 @@ def _fill_lane(rng, side: Side, lane: float) -> Iterator[Actor]:
 
 
 def _furnish_edge(rng, side: Side, kind: CampusKind, kerb: bool) -> Iterator[Actor]:
-    """Lamps and trees in rows, bollards along a kerb, and what stands about."""
+    """Yield rows of lamps and trees, bollards along a kerb, and scattered things."""
     out = SHOULDER_M if kind.path else -0.5
     if kerb:
         bollard, gap = make_prop(furniture.make_bollard(rng)), rng.uniform(1.4, 2.5)
@@ -186,7 +188,7 @@ def _furnish_edge(rng, side: Side, kind: CampusKind, kerb: bool) -> Iterator[Act
 
 
 def _place_rack(rng, side: Side, along: float, out: float) -> Iterator[Actor]:
-    """Hoops in a row, most with a bicycle at one side of them."""
+    """Yield a row of bicycle stands, most with a bicycle."""
     for i in range(rng.integers(2, 9)):
         yield side.put(furniture.make_bicycle_stand(rng), along + 0.9 * i, out, np.pi / 2)
         if rng.random() < 0.75:
@@ -195,7 +197,7 @@ def _place_rack(rng, side: Side, along: float, out: float) -> Iterator[Actor]:
 
 
 def _place_things(rng, court: Court, kind: CampusKind, people: float) -> Iterator[list[Actor]]:
-    """Planters, trees and things on the pavement; chairs of cafes with who sits there."""
+    """Yield planters, trees, benches, cafe chairs with people, and things on the pavement."""
     for x, y in court.spots(rng, kind.things):
         turn, pick = rng.uniform(-np.pi, np.pi), rng.random()
         if pick < 0.2:

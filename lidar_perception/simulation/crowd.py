@@ -1,4 +1,4 @@
-"""Who is on foot: alone, in groups, and those who talk."""
+"""People on foot and in wheelchairs, alone or in groups."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from lidar_perception.simulation.shapes.wheelchairs import make_wheelchair
 
 # Chances of groups of 1, 2, ... people.
 STANDING_CHANCES, WALKING_CHANCES = (0.55, 0.3, 0.1, 0.05), (0.62, 0.3, 0.08)
-BUSYNESS = 0.3, 1.0, 1.0, 2.5  # how busy a place is
-WHEELCHAIR_SHARE = 0.06  # for each group that walks or stands
+BUSYNESS = 0.3, 1.0, 1.0, 2.5  # factors for the number of people in a place
+WHEELCHAIR_SHARE = 0.06  # wheelchairs per group that walks or stands
 
 
 def make_person(rng, speed: float = 0.0) -> Thing:
-    """Someone who walks at that speed, m/s, or stands; some are children, some carry something."""
+    """Make a person who walks at a speed in m/s or stands; some are children or carry things."""
     carried = rng.choice(CARRIED, p=(0.6, 0.14, 0.14, 0.04, 0.04, 0.04))
     return make_pedestrian(rng, speed, child=rng.random() < 0.08, carried=str(carried))
 
 
 def place_standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
-    """People who wait, and some who talk and face one another."""
+    """Yield people who wait, and groups who face each other."""
     for along in scatter(rng, side.length, rate):
         out, many = rng.uniform(0.4, max(side.walk - 0.4, 1.0)), rng.choice([1, 2, 3, 4],
                                                                             p=STANDING_CHANCES)
@@ -37,8 +37,10 @@ def place_standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
 
 
 def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Actor]]:
-    """People on their way along a sidewalk, alone, in pairs or more; where they may roam, on the
-    road and in any direction, too. Some start or stop on the way."""
+    """Yield people who walk along a sidewalk, alone or in groups; some start or stop on the way.
+
+    roam: They also walk on the road and in any direction.
+    """
     for along in scatter(rng, side.length, rate):
         speed = _draw_speed(rng)
         turn = np.pi * rng.integers(2) + rng.normal(0, 0.02)
@@ -56,8 +58,10 @@ def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Act
 
 
 def place_strolling(rng, court: Court, rate: float) -> Iterator[list[Actor]]:
-    """People on their way across a place in any direction, rate groups on 100 square metres; half
-    of them start or stop on the way."""
+    """Yield groups who walk across a court in any direction, rate per 100 square metres.
+
+    Half of them start or stop on the way.
+    """
     for x, y in court.spots(rng, rate):
         speed, turn = _draw_speed(rng), rng.uniform(-np.pi, np.pi)
         moves = {"speed": speed}
@@ -69,14 +73,17 @@ def place_strolling(rng, court: Court, rate: float) -> Iterator[list[Actor]]:
 
 
 def _draw_speed(rng) -> float:
-    """m/s; some run."""
+    """Draw a walking speed in m/s; some people run."""
     return float(np.clip(rng.normal(1.35, 0.25), 0.6, 2.0) if rng.random() < 0.97 else 2.7)
 
 
 def fill_court(rng, room: Room, court: Court, people: float, along: float, across: float,
                standers: float) -> None:
-    """Who is on foot in a court: groups who walk along x and groups who stand on each 100 m of it,
-    groups who walk anywhere on each 100 square metres, each times people and by the hour."""
+    """Add people on foot to a court.
+
+    along, standers: groups who walk along x, and who stand, per 100 m; across: groups who walk
+    anywhere, per 100 square metres. All are multiplied by people and by how busy the place is.
+    """
     people *= rng.choice(BUSYNESS)
     for groups in (place_standing(rng, court.floor, standers * people),
                    place_walking(rng, court.floor, along * people, roam=False),
@@ -88,7 +95,7 @@ def fill_court(rng, room: Room, court: Court, people: float, along: float, acros
 
 
 def place_wheelchairs(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
-    """People in wheelchairs, along a side."""
+    """Yield people in wheelchairs along a side."""
     for along in scatter(rng, side.length, rate):
         yield [side.put(make_wheelchair(rng), along, rng.uniform(0.5, max(side.walk - 0.5, 0.6)),
                         np.pi * rng.integers(2) + rng.normal(0, 0.1),
@@ -96,7 +103,7 @@ def place_wheelchairs(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
 
 
 def place_bench(rng, side: Side, along: float, out: float, people: float) -> list[Actor]:
-    """A bench whose back is towards the outside of a side, and who sits there."""
+    """Return a bench with its back to the outside of a side, and the people on it."""
     sitters = [side.put(make_sitting_person(rng, chair=False), along + aside, out, -np.pi / 2)
                for aside in (-0.45, 0.45) if rng.random() < min(0.25 * people, 0.8)]
     return [side.put(furniture.make_bench(rng), along, out, -np.pi / 2), *sitters]

@@ -1,7 +1,7 @@
-"""Simulated scans as data sets of other layouts, written by many processes.
+"""Simulated scans as data sets of other layouts, written by several processes.
 
-Every frame is made from its number alone, so that neither the number of processes nor a stop in
-between changes a byte.
+Every frame depends only on its number, so neither the number of processes nor an interruption
+changes a byte.
 """
 
 from __future__ import annotations
@@ -29,8 +29,11 @@ FOLDERS = ("training", "sequences")  # that one of them has in it
 
 @dataclass(frozen=True)
 class DatasetPlan:
-    """frames scans, streets_of of each of the scenes seed, seed + 1, ..., in one of LAYOUTS.
-    InputError for numbers that cannot be."""
+    """A data set of `frames` scans, streets_of of each of the scenes seed, seed + 1, ...
+
+    Raises:
+        InputError: A number is out of range, or the layout is unknown.
+    """
 
     layout: str
     sensor: Sensor
@@ -41,7 +44,7 @@ class DatasetPlan:
 
     def __post_init__(self) -> None:
         most = longest_drive(self.sensor)
-        self.scenes.sorts()
+        self.scenes.scene_types()
         for wrong, what in (
                 (self.layout not in ("mcap", *LAYOUTS), f"layout = {self.layout!r} must be one of "
                                              f"{', '.join(LAYOUTS)}"),
@@ -55,11 +58,10 @@ class DatasetPlan:
 
 
 def write_frame(folder: Path, plan: DatasetPlan, number: int) -> None:
-    """Simulate and write frame number, all of its files. InputError where one cannot be
-    written."""
+    """Simulate a frame and write all of its files. Raise InputError if one cannot be written."""
     sequence, moment = divmod(number, plan.streets_of)
     scan = simulate_scan(plan.seed + sequence, moment, plan.sensor, plan.scenes)
-    order = np.argsort(scan.ring, kind="stable")  # as in KITTI's files, beam after beam
+    order = np.argsort(scan.ring, kind="stable")  # as in KITTI's files, beam by beam
     cloud = scan.frame.points()[order]
     if plan.layout == "semantickitti":
         shares = _write_semantickitti(folder, plan, sequence, moment, scan, cloud, order)
@@ -94,8 +96,13 @@ def _write_semantickitti(folder: Path, plan: DatasetPlan, sequence: int, moment:
 
 
 def write_frames(folder: Path, plan: DatasetPlan, numbers: list[int], jobs: int) -> Generator[int]:
-    """Write the frames of these numbers with so many processes; yields each when it is there.
-    InputError, and the end of all processes, where one fails; they end with the iterator too."""
+    """Write frames in several processes, and yield the number of each when it is written.
+
+    The processes end with the iterator.
+
+    Raises:
+        InputError: A process failed.
+    """
     return run_in_processes(functools.partial(_make_writer, folder, plan), numbers, jobs,
                             "wrote frames")
 

@@ -1,4 +1,4 @@
-"""Simulated drives: scans of a scene, one a turn of the sensor, with all that is known of them."""
+"""Simulated drives: scans of a scene with full ground truth, one per turn of the sensor."""
 
 from __future__ import annotations
 
@@ -18,19 +18,23 @@ from lidar_perception.types import GroundTruth, InputError, PointCloud
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 START_NS = 1_700_000_000 * 10**9
-LABEL_RANGE_M = 80.0  # metres; what is farther has no label, as in KITTI
+LABEL_RANGE_M = 80.0  # farther objects have no label, as in KITTI
 
 MOVING_CLASSES = {still: moving for moving, still in MOVING.items()}
 
 
 @dataclass(frozen=True)
 class SimulatedScan:
-    """One turn of the sensor: N points, in the sensor's frame at frame.stamp_ns.
+    """One turn of the sensor, with N points.
 
-    truth: the objects all around; semantic (N,) uint16 SemanticKITTI classes, the moving ones
-    too; instance (N,) uint16 track id of the object, 0 for none; ring (N,) uint16, 0 the highest
-    beam; time (N,) float32 seconds after the stamp; pose (4, 4) float64 the sensor's frame in that
-    of the drive's first scan.
+    Attributes:
+        frame: Cloud in the sensor's frame at frame.stamp_ns.
+        truth: Objects all around.
+        semantic: (N,) uint16 SemanticKITTI classes, including the moving ones.
+        instance: (N,) uint16 track id of the object, 0 for none.
+        ring: (N,) uint16, 0 is the highest beam.
+        time: (N,) float32, seconds after the stamp.
+        pose: (4, 4) float64 pose of the sensor in its frame at the first scan of the drive.
     """
 
     frame: PointCloud
@@ -43,19 +47,21 @@ class SimulatedScan:
 
 
 def longest_drive(sensor: Sensor) -> int:
-    """Scans that fit into the time of one drive."""
+    """Return the number of scans in a full drive."""
     return int(DRIVE_SECONDS * sensor.rate)
 
 
 def simulate_drive(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E,
                    scenes: Scenes = ALL_STREETS) -> Iterator[SimulatedScan]:
-    """A drive through make_scene(seed, *scenes); the same for the same arguments.
+    """Simulate a drive through make_scene(seed, *scenes); the same for the same arguments.
 
-    Points are where they were met, in the sensor's frame at the stamp; boxes are those at the
-    stamp. Objects without a point or beyond LABEL_RANGE have no label. extras: track_id,
-    truncated 0.0, occluded 0 | 1 | 2 as in KITTI, num_points, visible (the share of the object's
-    directions that is not hidden behind others). InputError (at the call) for a seed
-    or a number of frames out of range.
+    Points and boxes are in the sensor's frame at the stamp, compensated for motion. Objects without
+    a point or beyond LABEL_RANGE_M have no label. Their extras are track_id, truncated (0.0),
+    occluded (0 | 1 | 2 as in KITTI), num_points and visible (share of the object's directions that
+    other objects do not hide).
+
+    Raises:
+        InputError: The seed or the number of frames is out of range; raised at the call.
     """
     most = longest_drive(sensor)
     if not 1 <= frames <= most:
@@ -66,8 +72,8 @@ def simulate_drive(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E,
 
 
 def simulate_scan(seed: int, i: int, sensor: Sensor, scenes: Scenes = ALL_STREETS) -> SimulatedScan:
-    """Scan i of the drive through the scene of a seed, whatever was asked for before."""
-    # Beams that wander do so from scene to scene too: of each there may be one scan only.
+    """Simulate scan i of the drive through the scene of a seed, independently of other scans."""
+    # Wandering beams also differ between scenes, of which there may be only one scan each.
     scene, sensor = _make_cached_scene(seed, scenes), sensor.at_turn(seed + i)
     moment = scene.at(i / sensor.rate, sensor.height)
     hits = cast_rays(moment.solids, scene.ground, moment.position, sensor, moment.motion,
@@ -84,11 +90,11 @@ def simulate_scan(seed: int, i: int, sensor: Sensor, scenes: Scenes = ALL_STREET
 
 
 def label_scan(moment: SceneMoment, hits: Hits, owner: np.ndarray) -> GroundTruth:
-    """The labels of a scan whose points belong to owner (N,)."""
+    """Return the labels of a scan whose points belong to the objects owner (N,)."""
     size = len(hits.reached)
     points = np.bincount(owner, minlength=size)[moment.track_ids]
     visible = np.bincount(hits.owner.ravel(), minlength=size)[moment.track_ids]
-    # The rim of a beam may meet an object that the middle of none would.
+    # The edge of a beam may hit an object that no beam centre hits.
     share = np.minimum(visible / np.maximum(hits.reached[moment.track_ids], 1), 1.0)
     occluded = (share < 0.8).astype(int) + (share < 0.4)
     keep = (points > 0) & (np.hypot(*moment.boxes[:, :2].T) <= LABEL_RANGE_M)
@@ -105,7 +111,7 @@ def _make_cached_scene(seed: int, scenes: Scenes) -> Scene:
 
 
 def _mark_moving(moment: SceneMoment, owner: np.ndarray, semantic: np.ndarray) -> np.ndarray:
-    """semantic (N,) with the classes of what moves for the points of owners that do."""
+    """Return semantic (N,) with the moving classes for points of owners that move."""
     moves = np.zeros(int(max(moment.track_ids, default=0)) + 1, bool)
     moves[moment.track_ids[moment.speeds > 0]] = True
     table = np.arange(1 << 16, dtype=np.uint16)

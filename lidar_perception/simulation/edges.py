@@ -1,10 +1,9 @@
-"""Beams are wide: what comes back where a beam meets the edges of things.
+"""Returns of beams that hit the edge of an object.
 
-Where a ray's neighbours on the grid meet other solids than it does, a second ray is cast, to a
-random place in the beam's footprint. So it meets something else with a probability that is the
-share of the footprint beyond the edge. A random share of the beam's energy then falls on what the
-second ray meets; if both surfaces are within the length of the pulse, they give one return between
-them, and the stronger one of the two otherwise.
+If a ray's neighbours on the grid hit other solids, a second ray is cast to a random place in the
+beam's footprint, so the chance of hitting another solid is the share of the footprint beyond the
+edge. A random share of the energy falls on the second hit. If both surfaces are within the length
+of the pulse, they give one return between them, otherwise the stronger one.
 """
 
 from __future__ import annotations
@@ -17,12 +16,19 @@ from numba import njit
 
 from lidar_perception.simulation.hashing import hash_uniform
 
-OUTLIER = 1  # SemanticKITTI's class of returns that are from no surface
+OUTLIER = 1  # SemanticKITTI class of returns that are from no surface
 
 
 class RayHit(NamedTuple):
-    """What a ray meets: range m, inf where nothing; brightness and cosine of the incidence; owner,
-    0 where no object; semantic class, 0 where nothing; solid, -1 where none."""
+    """The first hit of a ray.
+
+    Attributes:
+        range: Metres, inf without a hit.
+        brightness, cosine: Brightness and cosine of the incidence.
+        owner: Object, 0 for none.
+        semantic: SemanticKITTI class, 0 without a hit.
+        solid: Index of the solid, -1 for none.
+    """
 
     range: float
     brightness: float
@@ -33,7 +39,7 @@ class RayHit(NamedTuple):
 
 
 def find_edges(solid: np.ndarray) -> np.ndarray:
-    """(columns, rings) bool: a neighbour has another solid."""
+    """Return (columns, rings) bool: a neighbouring ray hits another solid."""
     edge = np.zeros(solid.shape, bool)
     other = solid != np.roll(solid, 1, axis=0)
     edge |= other | np.roll(other, -1, axis=0)
@@ -45,7 +51,7 @@ def find_edges(solid: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def draw_in_footprint(way, divergence, key):
-    """Direction to a random place, uniform in the disc of the beam along way (x, y, z)."""
+    """Draw a direction uniformly in the disc of a beam along way (x, y, z)."""
     x, y, z = way
     radius = divergence / 2 * math.sqrt(hash_uniform(3, key))
     turn = 2 * np.pi * hash_uniform(4, key)
@@ -59,10 +65,10 @@ def draw_in_footprint(way, divergence, key):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def merge_hits(one, other, pulse, key):
-    """The Met of a beam whose two rays meet one and other."""
+    """Return the hit of a beam whose two rays have the hits one and other."""
     if one.solid == other.solid:
         return one
-    share = hash_uniform(5, key)  # of other
+    share = hash_uniform(5, key)  # of the energy on the other hit
     first, second = one.brightness * (1 - share), other.brightness * share
     if one.range < np.inf and other.range < np.inf and abs(one.range - other.range) < pulse:
         return RayHit(one.range * (1 - share) + other.range * share, first + second,

@@ -1,4 +1,4 @@
-"""Beams through leaves, which hang in clumps with gaps between them."""
+"""Beams through leaves, which grow in clumps with gaps between them."""
 
 from __future__ import annotations
 
@@ -9,21 +9,26 @@ from numba import njit
 
 from lidar_perception.simulation.hashing import hash_uniform, mix_bits
 
-# Cells so many metres wide, of which this share holds all the leaves. With leaves everywhere a
-# crown is one cluster for DBSCAN; KITTI's fall into many. STEPS: within so many either a leaf is
-# met or the beam is taken to pass.
+# Width of cells, and the share of them that holds all leaves. With leaves everywhere a crown would
+# be one cluster for DBSCAN; KITTI's crowns fall into many. A beam that hits no leaf within
+# MAX_STEPS passes.
 CELL_M, LEAF_SHARE, MAX_STEPS = 0.5, 0.25, 12
 
 
 @njit(cache=True, nogil=True)
 def trace_foliage(start, way, half, enter, leave, density, plant, key, filled):
-    """Range in metres at which leaves stop a ray, inf where it passes: delta tracking (Woodcock et
-    al., 1965) through a grid of full and empty cells.
+    """Return the range in metres at which leaves stop a ray, inf if it passes.
 
-    start, way: three numbers each, the ray in the frame of a unit shape; half: the half sizes of
-    that, m; enter, leave: ranges, m; density: mean, 1/m; plant: uint64, the same for all rays of a
-    plant and all along a drive; key: uint64, of the random numbers of this ray and plant; filled:
-    share of the cells that hold leaves.
+    Delta tracking (Woodcock et al., 1965) through a grid of full and empty cells.
+
+    Args:
+        start, way: Ray in the frame of a unit shape, three numbers each.
+        half: Half sizes of the shape, m.
+        enter, leave: Ranges at which the ray enters and leaves the shape, m.
+        density: Mean density, 1/m.
+        plant: uint64, equal for all rays to a plant in a drive.
+        key: uint64, for the random numbers of this ray and plant.
+        filled: Share of the cells that hold leaves.
     """
     t = max(enter, 0.0)
     for step in range(MAX_STEPS):

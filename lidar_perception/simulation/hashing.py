@@ -1,4 +1,4 @@
-"""Random numbers that depend on nothing but a key: a counter-based hash, compiled."""
+"""Random numbers that depend only on a key, in any order: a compiled counter-based hash."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ GOLDEN, FIRST, SECOND = (np.uint64(n) for n in (
 
 @njit(cache=True, nogil=True)
 def hash_uniform(seed, key):
-    """float64 in the open interval 0 .. 1 for a uint64 key and a small seed; the same in any order.
-    The finalizer is splitmix64's (Steele, Lea and Flood, OOPSLA 2014)."""
+    """Return a float64 in the open interval 0 .. 1 for a uint64 key and a small seed.
+
+    The finalizer is that of splitmix64 (Steele, Lea and Flood, OOPSLA 2014).
+    """
     bits = mix_bits(mix_bits(key) + np.uint64(seed) * GOLDEN) >> np.uint64(12)
     return (np.float64(bits) + 0.5) * 2.0 ** -52
 
 
 @njit(cache=True, nogil=True)
 def mix_bits(x):
-    """uint64 to uint64, one to one."""
+    """Map uint64 to uint64, one to one."""
     x = (x ^ (x >> np.uint64(30))) * FIRST
     x = (x ^ (x >> np.uint64(27))) * SECOND
     return x ^ (x >> np.uint64(31))

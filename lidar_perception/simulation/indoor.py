@@ -1,4 +1,4 @@
-"""Within buildings: corridors, halls, canteens and stores, laid out around the way of a robot."""
+"""Interiors: corridors, halls, canteens and stores around a robot's trajectory."""
 
 from __future__ import annotations
 
@@ -21,22 +21,25 @@ from lidar_perception.simulation.trajectory import (
     draw_trajectory,
 )
 
-WINDOW_VIEW_M = 4.0  # m from windows to the plants before them
-SEAT_WIDTH_M = 0.65    # m of a table for each who sits at it
+WINDOW_VIEW_M = 4.0  # from windows to the plants outside
+SEAT_WIDTH_M = 0.65  # of a table, per person
 
 
 @dataclass(frozen=True)
 class IndoorKind:
-    """Ranges (low, high) are drawn from uniformly; lengths in metres; shares and chances are in
-    0 .. 1. What comes first is laid out around the way of the robot."""
+    """A kind of interior.
 
-    share: float                  # how often it is drawn
-    wide: tuple[float, float]     # from the way to the walls beside it
+    Ranges (low, high) are drawn from uniformly. Lengths are in m, shares and chances 0 .. 1. The
+    walls are laid out around the trajectory of the robot.
+    """
+
+    share: float                  # of the scenes
+    wide: tuple[float, float]     # from the trajectory to the walls beside it
     ends: tuple[float, float]     # and to those behind and ahead
     height: tuple[float, float]
-    walls: dict[str, float]       # what they are made of (WALLS), and how often
-    fill: tuple[str, ...]         # what stands in it (FILLS)
-    turn: float                   # how far the robot turns to both sides at most, rad
+    walls: dict[str, float]       # weights of their pieces, see WALLS
+    fill: tuple[str, ...]         # furniture, see FILLS
+    turn: float                   # largest heading of the robot to both sides, rad
     outer: float = 0.0            # chance that a side is all windows
     at_walls: float = 12.0        # things on 100 m
     things: float = 0.3           # things on 100 square metres
@@ -61,7 +64,7 @@ INDOOR_KINDS = {
         "wall": 0.8, "door": 0.15, "glazing": 0.05}, ("shelves",), 0.1, across=2.0, along=18.0,
         standers=16.0, things=0.5),
 }
-WALLS = {  # what is made, and lengths
+WALLS = {  # maker, and smallest and largest length
     "wall": (interiors.make_wall, 1.0, 7.0), "door": (interiors.make_door, 1.2, 1.7),
     "glazing": (interiors.make_glazing, 2.0, 6.0), "passage": (interiors.make_passage, 1.8, 3.2),
     "window": (interiors.make_window, 3.0, 9.0)}
@@ -71,7 +74,7 @@ THINGS = (*interiors.PERSON_SIZED, furniture.make_planter, furniture.make_litter
 
 def make_interior(rng: np.random.Generator, kind: IndoorKind,
                   people: float) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
-    """A level floor with walls, ceiling, furniture and people, and a robot's way through it."""
+    """Make a level floor with walls, ceiling, furniture and people, and a robot's trajectory."""
     way = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
     room = Room(DRIVE_SECONDS, way=way, radius=ROBOT_RADIUS_M)
     court = Court.around(way.sampled(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2),
@@ -90,7 +93,7 @@ def make_interior(rng: np.random.Generator, kind: IndoorKind,
         made = THINGS[rng.integers(len(THINGS))](rng)
         room.admit(Actor(make_prop(made), x, y, rng.uniform(-np.pi, np.pi)), gap=0.3)
     crowd.fill_court(rng, room, court, people, kind.along, kind.across, kind.standers)
-    # Last, as it is in nobody's way.
+    # Last, since it blocks nobody.
     lid = court.inner(-interiors.WALL_THICKNESS_M)
     room.add(Actor(make_prop(interiors.make_ceiling(rng, lid.x1 - lid.x0, lid.y1 - lid.y0, height)),
                    *court.centre))
@@ -98,7 +101,7 @@ def make_interior(rng: np.random.Generator, kind: IndoorKind,
 
 
 def _build_walls(rng, side: Side, kind: IndoorKind, height: float) -> Iterator[Actor]:
-    """A wall of one piece after the other, or of windows with plants before them."""
+    """Yield a wall piece by piece, or windows with plants outside."""
     names, shares = list(kind.walls), list(kind.walls.values())
     outer = rng.random() < kind.outer
     along = 0.0
@@ -115,7 +118,7 @@ def _build_walls(rng, side: Side, kind: IndoorKind, height: float) -> Iterator[A
 
 
 def _place_columns(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
-    """Alike, in rows."""
+    """Yield rows of equal columns."""
     made = make_prop(interiors.make_column(rng, height))
     (dx, dy), (x, y) = rng.uniform(5.0, 10.0, 2), rng.uniform(1.0, 5.0, 2)
     for at_x in np.arange(court.x0 + x, court.x1 - 1, dx):
@@ -124,7 +127,7 @@ def _place_columns(rng, court: Court, height: float, people: float) -> Iterator[
 
 
 def _place_benches(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
-    """Along the walls, and counters."""
+    """Yield benches along the walls, and counters."""
     for side in court.sides():
         for along in space_evenly(rng, side.length, rng.uniform(4.0, 12.0)):
             if rng.random() < 0.6:
@@ -135,13 +138,13 @@ def _place_benches(rng, court: Court, height: float, people: float) -> Iterator[
 
 
 def _scatter_tables(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
-    """Tables here and there."""
+    """Yield scattered tables."""
     for x, y in court.inner(1.5).spots(rng, 1.5):
         yield _set_table(rng, x, y, rng.uniform(-np.pi, np.pi), people)
 
 
 def _line_up_tables(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
-    """Tables in rows."""
+    """Yield rows of tables."""
     dx, dy = rng.uniform(2.2, 3.5, 2)
     turn = np.pi / 2 * rng.integers(2)
     for x in np.arange(court.x0 + 1.3, court.x1 - 1.2, dx):
@@ -152,7 +155,7 @@ def _line_up_tables(rng, court: Court, height: float, people: float) -> Iterator
 
 
 def _set_table(rng, x: float, y: float, turn: float, people: float) -> list[Actor]:
-    """A table with chairs at its long sides, and who sits there."""
+    """Return a table with chairs and people at its long sides."""
     long, wide = rng.uniform((0.7, 0.65), (2.0, 0.9))
     table = Actor(make_prop(interiors.make_table(rng, long, wide)), x, y, turn)
     line, around = Side(x, y, turn, 0.0, 0.0, ""), []
@@ -169,7 +172,7 @@ def _set_table(rng, x: float, y: float, turn: float, people: float) -> list[Acto
 
 
 def _place_shelves(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
-    """Rows of them along x, with aisles between."""
+    """Yield rows of shelves along x with aisles between."""
     aisle, y = rng.uniform(1.6, 2.8), court.y0 + 0.5
     while y < court.y1 - 0.4:
         x = court.x0 + rng.uniform(1.0, 2.5)

@@ -1,6 +1,6 @@
-"""One ray against one solid, compiled.
+"""Compiled intersection of one ray with one solid.
 
-All solids are unit shapes under a linear map; a ray is within a unit shape while it is within all
+All solids are unit shapes under a linear map. A ray is within a unit shape while it is within all
 the slabs and quadrics that bound it (Kay and Kajiya, SIGGRAPH 1986).
 """
 
@@ -20,10 +20,15 @@ from lidar_perception.simulation.terrain import compute_brightness
 
 
 class CompiledSolids(NamedTuple):
-    """P solids for compiled code. matrix (P, 3, 3): to the unit shape; offset (P, 3): where that
-    takes the frame's origin; drift (P, 3): what it takes the sensor's velocity against the solid
-    to. plant (P,) uint64: of the leaves; salt (P,) uint64: of random numbers. The rest as in
-    Solids."""
+    """P solids for compiled code; fields that are not listed are those of Solids.
+
+    Attributes:
+        matrix: (P, 3, 3) map to the unit shape.
+        offset: (P, 3) image of the frame's origin.
+        drift: (P, 3) image of the sensor's velocity relative to the solid.
+        plant: (P,) uint64, seed of the leaves.
+        salt: (P,) uint64, seed of random numbers.
+    """
 
     matrix: np.ndarray
     offset: np.ndarray
@@ -39,10 +44,10 @@ class CompiledSolids(NamedTuple):
 
 
 def compile_solids(solids: Solids, motion: Motion, salt: np.uint64) -> CompiledSolids:
-    """Solids in the sensor's frame at the stamp; salt: of the scan."""
+    """Convert solids for a scan. motion: of the sensor; salt: seed of the scan."""
     matrix = np.swapaxes(solids.axes, 1, 2) / solids.half[:, :, None]
     slides = np.asarray(motion.velocity, np.float64) - solids.velocity
-    # Copies, as compiled code is compiled anew for arrays that are read-only or lie otherwise.
+    # Copies, since Numba compiles again for read-only arrays and other memory layouts.
     density, transmission, reflectance = (np.array(part, np.float64) for part in (
         solids.density, solids.transmission, solids.reflectance))
     return CompiledSolids(
@@ -54,8 +59,10 @@ def compile_solids(solids: Solids, motion: Motion, salt: np.uint64) -> CompiledS
 
 @njit(cache=True, nogil=True)
 def to_unit_frame(shapes, s, way, since, lift):
-    """Start and direction (x, y, z) of a ray in the frame of unit shape s; since: seconds after the
-    stamp; lift: of its start over the sensor's origin, m."""
+    """Return start and direction (x, y, z) of a ray in the frame of unit shape s.
+
+    since: seconds after the stamp; lift: height of its start above the sensor's origin, m.
+    """
     m, o, v = shapes.matrix[s], shapes.offset[s], shapes.drift[s]
     start = (o[0] + m[0, 2] * lift + v[0] * since, o[1] + m[1, 2] * lift + v[1] * since,
              o[2] + m[2, 2] * lift + v[2] * since)
@@ -67,8 +74,10 @@ def to_unit_frame(shapes, s, way, since, lift):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def intersect_shape(kind, start, way):
-    """Ranges at which a ray enters and leaves a unit shape; (inf, -inf) where it misses. A ray
-    exactly along a cylinder or on the face of a box is taken as a miss."""
+    """Return the ranges at which a ray enters and leaves a unit shape, (inf, -inf) for a miss.
+
+    A ray exactly along a cylinder, or in the face of a box, misses.
+    """
     enter, leave = -np.inf, np.inf
     for i in range(3):
         if kind == BOX or (kind == CYLINDER and i == 2):
@@ -94,8 +103,11 @@ def intersect_shape(kind, start, way):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_stop_range(shapes, s, start, way, enter, leave, number, filled):
-    """Range at which a ray that passes through the shape of solid s is stopped; inf where it is
-    not, as when it starts within an opaque one. number: of the ray; filled: see foliage.py."""
+    """Return the range at which solid s stops a ray that passes through its shape, else inf.
+
+    A ray that starts within an opaque solid is not stopped. number: number of the ray; filled: see
+    foliage.py.
+    """
     t = enter if enter > 0 else np.inf
     key = shapes.salt[s] + np.uint64(number)
     if shapes.density[s] < np.inf:
@@ -112,10 +124,10 @@ def find_stop_range(shapes, s, start, way, enter, leave, number, filled):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def shade_hit(shapes, s, way, since, lift, number):
-    """Brightness and cosine of the incidence of a ray that ends on solid s."""
+    """Return brightness and cosine of the incidence of a ray that ends on solid s."""
     reflectance = shapes.reflectance[s]
     if shapes.density[s] < np.inf:
-        # Leaves face anywhere: so much the neighbours of vegetation's points differ on
+        # Leaves face all directions. Neighbouring points of vegetation differ as much on
         # SemanticKITTI.
         scatter = hash_uniform(6, shapes.salt[s] + np.uint64(number))
         return compute_brightness(reflectance, 0.5) * (0.5 + scatter), 1.0
@@ -133,7 +145,7 @@ def shade_hit(shapes, s, way, since, lift, number):
 
 @njit(cache=True, nogil=True)
 def _normal(kind, x, y, z):
-    """Outward direction of the unit shape at a point of its surface."""
+    """Return the outward normal of a unit shape at a point of its surface."""
     if kind == ELLIPSOID:
         return x, y, z
     if kind == CYLINDER:

@@ -1,4 +1,4 @@
-"""Where things are put: along a line, in a rectangle."""
+"""Lines and rectangles along and in which things are placed."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ from lidar_perception.simulation.solids import compute_extents
 
 
 class Side(NamedTuple):
-    """The line of a curb from x, y along heading. What is beyond it lies to its left: walk metres
-    of sidewalk, then the front. parking: width of the strip on this side of the curb."""
+    """The line of a curb from x, y along heading, in m and rad.
+
+    To its left are `walk` metres of sidewalk, then the front. parking: width of the parking strip
+    to its right.
+    """
 
     x: float
     y: float
@@ -27,8 +30,10 @@ class Side(NamedTuple):
 
     def put(self, thing: Thing | np.ndarray, along: float, out: float, turn: float = 0.0,
             **moves) -> Actor:
-        """An actor so far along the curb and out from it, turned against its line; parts (P,) PART
-        are a thing without a label."""
+        """Return an actor `along` the curb and `out` from it (m), turned against the line (rad).
+
+        Parts (P,) PART become a thing without a label.
+        """
         thing = make_prop(thing) if isinstance(thing, np.ndarray) else thing
         cos, sin = math.cos(self.heading), math.sin(self.heading)
         return Actor(thing, self.x + cos * along - sin * out, self.y + sin * along + cos * out,
@@ -36,7 +41,7 @@ class Side(NamedTuple):
 
 
 class Court(NamedTuple):
-    """The rectangle from x0, y0 to x1, y1 (world, m)."""
+    """A rectangle from x0, y0 to x1, y1 in the world, m."""
 
     x0: float
     y0: float
@@ -45,21 +50,25 @@ class Court(NamedTuple):
 
     @staticmethod
     def around(way: np.ndarray, ends: np.ndarray, wide: np.ndarray) -> Court:
-        """What reaches so far (2,) behind and ahead of a way (T, 2), and right and left of it."""
+        """Return the court around a path (T, 2).
+
+        ends: (2,) margins behind and ahead; wide: (2,) margins to the right and left, m.
+        """
         low, high = way.min(axis=0), way.max(axis=0)
         return Court(*(low - [ends[0], wide[0]]).tolist(), *(high + [ends[1], wide[1]]).tolist())
 
     @property
     def centre(self) -> tuple[float, float]:
+        """Centre of the rectangle."""
         return (self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2
 
     @property
     def floor(self) -> Side:
-        """Its edge at y0 as a line with all of it to the left: what walks along it."""
+        """The edge at y0 as a line with the whole court to its left."""
         return Side(self.x0, self.y0, 0.0, self.x1 - self.x0, self.y1 - self.y0, "")
 
     def sides(self, walk: float = 0.0, front: str = "") -> tuple[Side, Side, Side, Side]:
-        """Its edges as lines with the outside to their left: at y1, x0, y0, x1."""
+        """Return the edges at y1, x0, y0, x1 as lines with the outside to their left."""
         long, wide = self.x1 - self.x0, self.y1 - self.y0
         return (Side(self.x0, self.y1, 0.0, long, walk, front),
                 Side(self.x0, self.y0, np.pi / 2, wide, walk, front),
@@ -67,11 +76,11 @@ class Court(NamedTuple):
                 Side(self.x1, self.y1, -np.pi / 2, wide, walk, front))
 
     def inner(self, margin: float) -> Court:
-        """The rectangle that much within it."""
+        """Return the rectangle without a margin, m."""
         return Court(self.x0 + margin, self.y0 + margin, self.x1 - margin, self.y1 - margin)
 
     def spots(self, rng: np.random.Generator, rate: float) -> Iterator[tuple[float, float]]:
-        """Places (x, y), rate of them on 100 square metres in the mean, each on its own."""
+        """Yield random positions (x, y), rate per 100 square metres in the mean."""
         area = max(self.x1 - self.x0, 0.0) * max(self.y1 - self.y0, 0.0)
         for _ in range(rng.poisson(area * rate / 100)):
             yield rng.uniform(self.x0, self.x1), rng.uniform(self.y0, self.y1)
@@ -79,7 +88,7 @@ class Court(NamedTuple):
 
 def place_against(rng: np.random.Generator, side: Side, makers: Sequence[Callable],
                   rate: float) -> Iterator[Actor]:
-    """Things within a side with their backs to it, rate of them on 100 m, each by one of makers."""
+    """Yield things inside a side with their backs to it, rate per 100 m, made by random makers."""
     for along in scatter(rng, side.length, rate):
         made = makers[int(rng.integers(len(makers)))](rng)
         low, _ = compute_extents(made)
@@ -87,11 +96,11 @@ def place_against(rng: np.random.Generator, side: Side, makers: Sequence[Callabl
 
 
 def space_evenly(rng, length: float, spacing: float) -> np.ndarray:
-    """Places along a length, spacing apart in the mean."""
+    """Return positions along a length, spacing apart in the mean."""
     places = np.arange(rng.uniform(0, spacing), length, spacing)
     return np.clip(places + rng.uniform(-0.2, 0.2, len(places)) * spacing, 0, length)
 
 
 def scatter(rng, length: float, rate: float) -> np.ndarray:
-    """Places along a length, rate of them on 100 m in the mean, each on its own."""
+    """Return independent positions along a length, rate per 100 m in the mean."""
     return rng.uniform(0, length, rng.poisson(max(length, 0.0) * rate / 100))

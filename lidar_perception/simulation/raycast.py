@@ -1,12 +1,12 @@
-"""What the rays of a turn meet first, compiled.
+"""First hits of all rays of a turn, compiled.
 
-Solids are drawn into the grid of firings and beams as triangles are into a picture: each into its
-window (windows.py) of a depth buffer. Those that nobody labels come last and from near to far, so
-that most of their rays are found hidden with one comparison; then the ground, which takes longest,
-where it may be nearer.
-Beams at the edges of things are cast once more, into their footprint: see edges.py.
-Solids are in the sensor's frame at the stamp; the ground is in the world, against which that frame
-is turned about z alone.
+Solids are drawn into the grid of firings and beams as triangles into a picture, each into its
+window (windows.py) of a depth buffer. Unlabelled solids come last, from near to far, so that one
+comparison finds most of their rays hidden. The ground, which takes longest, is cast where it may be
+nearer. Beams at the edges of solids are cast a second time, into their footprint, see edges.py.
+
+Solids are in the sensor's frame at the stamp. The ground is in the world, against which that frame
+is turned about z only.
 """
 
 from __future__ import annotations
@@ -34,11 +34,17 @@ from lidar_perception.simulation.windows import find_windows
 
 
 class Hits(NamedTuple):
-    """What each ray meets first, without noise: (columns, rings) arrays. range float64 m, inf
-    where nothing, 0 where it starts in a tuft of grass; brightness float64 0..1; cosine float64:
-    of the incidence, 0 where nothing; owner int32, 0 where no object; semantic uint16, 0 where
-    nothing, 1 (outlier) for a return from between two things, see edges.py; solid int32, an
-    index into the solids, -1 where none. reached[k] rays would meet object k if it were alone."""
+    """First hits without noise, as (columns, rings) arrays.
+
+    Attributes:
+        range: float64 m; inf without a hit, 0 if the ray starts in a tuft of grass.
+        brightness: float64, 0..1.
+        cosine: float64 cosine of the incidence, 0 without a hit.
+        owner: int32 object, 0 for none.
+        semantic: uint16 class; 0 without a hit, 1 (outlier) between two surfaces, see edges.py.
+        solid: int32 index of the solid, -1 for none.
+        reached: reached[k] rays would hit object k if it were alone.
+    """
 
     range: np.ndarray
     brightness: np.ndarray
@@ -50,8 +56,13 @@ class Hits(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """The rays of a turn for compiled code: direction (columns, rings, 3) in the sensor's frame at
-    the stamp; since (columns,) s after the stamp; lift (rings,) m over the sensor's origin."""
+    """The rays of a turn for compiled code.
+
+    Attributes:
+        direction: (columns, rings, 3) in the sensor's frame at the stamp.
+        since: (columns,) s after the stamp.
+        lift: (rings,) m above the sensor's origin.
+    """
 
     direction: np.ndarray
     since: np.ndarray
@@ -60,9 +71,17 @@ class Turn(NamedTuple):
 
 def cast_rays(solids: Solids, ground: Ground, position: np.ndarray, sensor: Sensor,
               motion: Motion = NO_MOTION, seed: int = 0, heading: float = 0.0) -> Hits:
-    """Cast all rays of one turn of a sensor at position (3,) m in the world at the stamp, over the
-    ground, that looks along heading; motion: of the sensor, in its own frame; seed, a whole number
-    (its lowest 64 bits count): of what is left to chance."""
+    """Cast all rays of one turn of a sensor.
+
+    Args:
+        solids: Solids in the sensor's frame at the stamp.
+        ground: The ground.
+        position: (3,) position of the sensor in the world at the stamp, m.
+        sensor: The sensor.
+        motion: Motion of the sensor in its own frame.
+        seed: Seed of the random choices; its lowest 64 bits count.
+        heading: Heading of the sensor in the world, rad.
+    """
     salt = np.uint64(mix_bits(np.uint64(seed % (1 << 64))))
     made = make_rays(sensor, motion)
     turn = Turn(made.direction, made.since, sensor.origins()[:, 2].copy())
@@ -88,20 +107,22 @@ def cast_rays(solids: Solids, ground: Ground, position: np.ndarray, sensor: Sens
 @njit(cache=True, nogil=True)
 def _cast_first(hits, turn, only, shapes, seen, order, ground, position, velocity, facing,
                 max_range, filled, counting):
-    """Fills the hits of only those rays, (columns, rings) bool; reached only where counting.
-    order: owner by owner, then from near to far what has none."""
+    """Fill the hits of the rays in only, (columns, rings) bool, and reached if counting.
+
+    order: solids owner by owner, then those without an owner from near to far.
+    """
     hits.range[:] = np.inf
     hits.solid[:] = -1
     _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, counting)
     columns, rings = only.shape
     for column in range(columns):
         since = turn.since[column]
-        along, aside, up = _turned(velocity, facing)
+        along, aside, up = _to_world(velocity, facing)
         x, y, z = position[0] + along * since, position[1] + aside * since, position[2] + up * since
         for ring in range(rings):
             if only[column, ring]:
                 way = _way(turn, column, ring)
-                start, down = (x, y, z + turn.lift[ring]), _turned(way, facing)
+                start, down = (x, y, z + turn.lift[ring]), _to_world(way, facing)
                 far, s = hits.range[column, ring], hits.solid[column, ring]
                 if not far < min_ground_range(ground, start, down):
                     met = cast_ground(ground, start, down, max_range)
@@ -119,9 +140,9 @@ def _cast_first(hits, turn, only, shapes, seen, order, ground, position, velocit
 
 
 @njit(cache=True, nogil=True)
-def _turned(vector, facing):
-    """A vector (x, y, z) of the sensor's frame in the world; facing: cosine and sine of the
-    heading."""
+def _to_world(vector, facing):
+    """Turn a vector (x, y, z) from the sensor's frame to the world. facing: cos and sin of heading.
+    """
     cos, sin = facing
     return cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1], vector[2]
 
@@ -135,7 +156,7 @@ def _way(turn, column, ring):
 @njit(cache=True, nogil=True)
 def _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, counting):
     columns, rings = only.shape
-    latest = np.zeros((columns, rings), np.int32)  # owner that a ray met; an owner's come together
+    latest = np.zeros((columns, rings), np.int32)  # last owner that a ray hit
     for s in order:
         owner, near = shapes.owner[s], seen.near[s]
         counts = counting and owner > 0
@@ -160,7 +181,7 @@ def _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, count
                 if counts and latest[column, ring] != owner:
                     latest[column, ring] = owner
                     hits.reached[owner] += 1
-                # Of hits closer than float32 tells the lower solid wins, whatever the order.
+                # If hits differ by less than float32 resolves, the lower solid wins in any order.
                 t32, far32, before = np.float32(t), np.float32(far), hits.solid[column, ring]
                 if t32 < far32 or (t32 == far32 and (before < 0 or s < before)):
                     hits.range[column, ring], hits.solid[column, ring] = t, s
@@ -168,7 +189,7 @@ def _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, count
 
 @njit(cache=True, nogil=True)
 def _turn_into_footprints(direction, only, divergence, salt):
-    """Turns only those rays into their beams' footprints."""
+    """Turn the rays in only to random places in their beams' footprints."""
     columns, rings = only.shape
     for column in range(columns):
         for ring in range(rings):
@@ -181,7 +202,7 @@ def _turn_into_footprints(direction, only, divergence, salt):
 
 @njit(cache=True, nogil=True)
 def _merge_edges(hits, other, only, pulse, salt):
-    """Joins what the two rays of only those beams meet, into hits."""
+    """Merge the hits of both rays of the beams in only into hits."""
     columns, rings = only.shape
     for column in range(columns):
         for ring in range(rings):

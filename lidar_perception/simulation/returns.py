@@ -1,4 +1,4 @@
-"""What a sensor makes of what its rays meet: noise, lost returns and intensity."""
+"""Returns that a sensor reports for the hits of its rays: noise, losses and intensity."""
 
 from __future__ import annotations
 
@@ -10,23 +10,31 @@ from lidar_perception.simulation.raycast import Hits
 from lidar_perception.simulation.sensor import NO_MOTION, Motion, Sensor, make_rays
 from lidar_perception.simulation.solids import RETROREFLECTOR
 
-# How a grazed surface weakens a return, as a power of the cosine of the incidence, and how the
-# logarithm of the power scatters. With these the road is lost as ahead of KITTI's car, where in 27
-# scans (median) 0.7 of the rays return from 38 m, 0.5 from 43 m, 0.35 from 50 m and none from 60 m.
-# Losses come in runs: on a SemanticKITTI scan only 0.03 of the returns of the road beyond 35 m are
+# Grazing incidence weakens a return by a power of the cosine of the incidence, and the logarithm of
+# the power scatters. With these values the road is lost as ahead of KITTI's car, where in 27 scans
+# (median) 0.7 of the rays return from 38 m, 0.5 from 43 m, 0.35 from 50 m and none from 60 m.
+# Losses come in runs: on a SemanticKITTI scan only 0.03 of the road's returns beyond 35 m are
 # missing between others.
 GRAZING_EXPONENT = 1 / 3
-POWER_SCATTER, SCATTER_COLUMNS = 0.5, 16  # RUN: columns
-# Of the intensity: so much neighbouring points of one beam differ on the road, sidewalks (0.03) and
-# facades (0.04) of a SemanticKITTI scan (robust standard deviation).
+POWER_SCATTER, SCATTER_COLUMNS = 0.5, 16  # standard deviation; columns of a run
+# Neighbouring points of one beam differ as much on the road, sidewalks (0.03) and facades (0.04) of
+# a SemanticKITTI scan (robust standard deviation).
 INTENSITY_NOISE = 0.035
 
 
 class Returns(NamedTuple):
-    """The points of one turn, beam by beam, each counter-clockwise from straight ahead, as in
-    KITTI's files. xyz (N, 3) float32 m in the sensor's frame; intensity (N,) float32 0..1 in
-    hundredths; owner (N,) int32 and semantic (N,) uint16 as in Hits; ring (N,) uint16, 0 the
-    highest beam; time (N,) float32 seconds after the stamp."""
+    """The N points of one turn, beam by beam, each counter-clockwise from straight ahead.
+
+    This is the order of KITTI's files.
+
+    Attributes:
+        xyz: (N, 3) float32, m in the sensor's frame.
+        intensity: (N,) float32, 0..1 in hundredths.
+        owner: (N,) int32, see Hits.
+        semantic: (N,) uint16, see Hits.
+        ring: (N,) uint16, 0 is the highest beam.
+        time: (N,) float32, seconds after the stamp.
+    """
 
     xyz: np.ndarray
     intensity: np.ndarray
@@ -38,24 +46,31 @@ class Returns(NamedTuple):
 
 def make_returns(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Generator,
             compensated: bool = True) -> Returns:
-    """What the sensor reports. compensated: the points are where they were met, in the frame at
-    the stamp, as KITTI publishes them; otherwise as if the sensor had stood still.
+    """Return the points that the sensor reports.
 
-    A return is lost where its power, which goes with brightness over range squared, is below that
-    of a surface of brightness 0.1 that faces the sensor at sensor.reach.
+    A return is lost if its power, which is proportional to brightness over range squared, is below
+    that of a surface of brightness 0.1 that faces the sensor at sensor.reach.
+
+    Args:
+        hits: Hits of all rays.
+        sensor: The sensor.
+        motion: Motion of the sensor.
+        rng: Random generator.
+        compensated: Points are in the frame at the stamp, as KITTI publishes them; otherwise as if
+            the sensor had not moved.
     """
     shape = hits.range.shape
     turn = make_rays(sensor, motion if compensated else NO_MOTION)
     noisy = hits.range + rng.normal(0.0, sensor.range_noise, shape)
     if sensor.offsets:
         noisy += np.asarray(sensor.offsets)
-    with np.errstate(divide="ignore", invalid="ignore"):  # no range over an endless reach: NaN
+    with np.errstate(divide="ignore", invalid="ignore"):  # no range over infinite reach: NaN
         power = (np.log(hits.brightness / 0.1) + GRAZING_EXPONENT * np.log(hits.cosine)
                  - 2 * np.log(hits.range / sensor.reach))
     scatter = rng.normal(0.0, POWER_SCATTER, (-(-shape[0] // SCATTER_COLUMNS), shape[1]))
     keep = power > np.repeat(scatter, SCATTER_COLUMNS, axis=0)[:shape[0]]
     keep &= (rng.random(shape) >= sensor.dropout) & sensor.open_rays()
-    # A hair within the limits, so that rounding to float32 does not step over them.
+    # Slightly within the limits, so that rounding to float32 does not exceed them.
     keep &= (noisy > sensor.min_range + 1e-4) & (noisy < sensor.max_range - 1e-4)
     ring, column = np.nonzero(keep.T)
     origin = np.broadcast_to(turn.origin, turn.direction.shape)

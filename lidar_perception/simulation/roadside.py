@@ -1,4 +1,4 @@
-"""What stands beside a road: houses, gardens, trees, bushes and street furniture."""
+"""Surroundings of a road: houses, gardens, trees, bushes and street furniture."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from lidar_perception.simulation.street import CORNER_WALK_M, Street, StreetKind
 
 PLANT_CLASSES = {70, 71}  # of SemanticKITTI
 BORDERS = (*[vegetation.make_hedge] * 3, *[furniture.make_fence] * 2, furniture.make_wall)
-# Of bushes and trees on 100 m, and how deep they stand, m: a wood, a hedgerow, fields.
+# Bushes and trees per 100 m, and the depth of their strip in m: a wood, a hedgerow, fields.
 WILD_FRONTS = ((110, 60, 4.0), (130, 12, 1.2), (8, 3, 15.0))
 RURAL_CLUTTER = (furniture.make_sign, furniture.make_beacon, furniture.make_bollard,
                  furniture.make_pole)
 
 
 def furnish(rng: np.random.Generator, street: Street, room: Room) -> None:
-    """Everything that never moves and has no label. Plants may grow into what stands there."""
+    """Add everything that never moves and has no label. Plants may overlap other things."""
     for side in (*street.blocks, *street.arms):
         for thing in FRONTS[side.front](rng, side):
             room.admit(thing, gap=-0.8 if is_plant(thing) else 0.1)
@@ -34,12 +34,12 @@ def furnish(rng: np.random.Generator, street: Street, room: Room) -> None:
 
 
 def is_plant(actor: Actor) -> bool:
-    """Whether an actor is nothing but leaves and wood."""
+    """Return True if an actor consists of leaves and wood only."""
     return PLANT_CLASSES.issuperset(actor.thing.parts(0.0)["semantic"].tolist())
 
 
 def make_clutter(rng, rural: bool = False) -> np.ndarray:
-    """One of the many things beside a road that have the size of a person, or a bare pole."""
+    """Make one of the roadside things of a person's size, or a bare pole."""
     choice = RURAL_CLUTTER if rural else (*furniture.PERSON_SIZED, furniture.make_pole)
     return choice[rng.integers(len(choice))](rng)
 
@@ -49,7 +49,7 @@ def _make_tree(rng) -> np.ndarray:
 
 
 def _build_facade(rng, side: Side) -> Iterator[Actor]:
-    """Houses wall to wall, now and then with a passage."""
+    """Yield houses wall to wall, some with a gap."""
     along, line = CORNER_WALK_M, side.walk + rng.uniform(0.1, 0.8)
     storeys = rng.integers(2, 6)
     while along < side.length - CORNER_WALK_M - 5:
@@ -64,7 +64,7 @@ def _build_facade(rng, side: Side) -> Iterator[Actor]:
 
 
 def _build_yard(rng, side: Side, line: float) -> Iterator[Actor]:
-    """What one sees between the houses."""
+    """Yield trees and bushes behind the houses."""
     for along in scatter(rng, side.length, 22):
         yield side.put(_make_tree(rng), along, line + rng.uniform(0, 30))
     for along in scatter(rng, side.length, 15):
@@ -73,7 +73,7 @@ def _build_yard(rng, side: Side, line: float) -> Iterator[Actor]:
 
 
 def _build_garden(rng, side: Side) -> Iterator[Actor]:
-    """Houses in gardens behind hedges, fences and walls."""
+    """Yield houses in gardens behind hedges, fences and walls."""
     along, line = CORNER_WALK_M, side.walk + 0.3
     border = BORDERS[rng.integers(len(BORDERS))]
     while along < side.length - CORNER_WALK_M - 9:
@@ -97,7 +97,7 @@ def _build_garden(rng, side: Side) -> Iterator[Actor]:
 
 
 def _build_verge(rng, side: Side) -> Iterator[Actor]:
-    """A strip of grass with rows of trees, and something far behind it."""
+    """Yield rows of trees on grass, and buildings or borders far behind."""
     deep = rng.uniform(4, 14)
     for along in space_evenly(rng, side.length, rng.uniform(7, 14)):
         yield side.put(_make_tree(rng), along, side.walk + rng.uniform(1.2, 1.8))
@@ -120,7 +120,7 @@ def _build_verge(rng, side: Side) -> Iterator[Actor]:
 
 
 def _build_wild(rng, side: Side) -> Iterator[Actor]:
-    """Grass, and woods, a hedgerow or fields behind."""
+    """Yield a wood, a hedgerow or fields behind grass."""
     near = side.walk + rng.uniform(1.5, 4.0)
     bushes, trees, deep = WILD_FRONTS[rng.choice(len(WILD_FRONTS), p=(0.4, 0.4, 0.2))]
     for along in scatter(rng, side.length, bushes):
@@ -137,7 +137,7 @@ def _build_wild(rng, side: Side) -> Iterator[Actor]:
 
 
 def _build_square(rng, side: Side) -> Iterator[Actor]:
-    """Facades that stand back behind trees, planters and bollards."""
+    """Yield facades set back behind trees, planters and bollards."""
     deep = rng.uniform(5, 14)
     yield from _build_facade(rng, side._replace(walk=side.walk + deep))
     for along in space_evenly(rng, side.length, rng.uniform(6, 10)):
@@ -152,7 +152,7 @@ FRONTS = {"facade": _build_facade, "garden": _build_garden, "verge": _build_verg
 
 
 def _place_furniture(rng, side: Side, kind: StreetKind) -> Iterator[Actor]:
-    """What stands along the curb, and against the walls."""
+    """Yield street furniture along the curb and against the walls."""
     rural = side.walk == 0.0
     edge = 1.0 if rural else 0.2
     for along in (0.6, side.length - 0.6):  # at the corners
@@ -165,7 +165,7 @@ def _place_furniture(rng, side: Side, kind: StreetKind) -> Iterator[Actor]:
     for along in scatter(rng, side.length, 2.2 * kind.clutter):
         made = make_clutter(rng, rural)
         low, high = compute_extents(made)
-        wide = np.abs([low[:, :2], high[:, :2]]).max()  # turned anyhow, it stays off the road
+        wide = np.abs([low[:, :2], high[:, :2]]).max()  # at any angle it stays off the road
         at_wall = not rural and rng.random() < 0.35
         out = side.walk - wide if at_wall else edge + wide + rng.uniform(0, 0.15)
         turn = rng.choice([0.0, np.pi / 2, np.pi, -np.pi / 2]) + rng.normal(0, 0.1)
@@ -173,7 +173,7 @@ def _place_furniture(rng, side: Side, kind: StreetKind) -> Iterator[Actor]:
 
 
 def _place_islands(rng, street: Street) -> Iterator[Actor]:
-    """Beacons and signs between the directions, at both ends of some crossings."""
+    """Yield beacons and signs between the directions at both ends of some crossings."""
     ours, oncoming = street.lanes[0], [lane.y for lane in street.lanes if lane.direction < 0]
     middle = (ours.y + min(oncoming)) / 2
     for crossing in street.ground.crossings:

@@ -1,7 +1,7 @@
-"""A drive through a scene: what that is in the LiDAR frame at any time.
+"""Scenes, and their content in the LiDAR frame at any time of a drive.
 
-A scene is a ground, things that stand or move on it, and the way of the sensor. Places make them: a
-street for a car, or where robots are that drive on no road.
+A scene is a ground, things that stand or move on it, and the trajectory of the sensor. It is a
+street for a car, or a campus or interior for a robot.
 """
 
 from __future__ import annotations
@@ -25,21 +25,26 @@ from lidar_perception.simulation.traffic import populate
 from lidar_perception.simulation.trajectory import DRIVE_SECONDS, Trajectory
 from lidar_perception.types import CLASSES, InputError, did_you_mean
 
-MAX_PEOPLE = 100  # times as many as usual; a street then takes 3 s, and has no room for more
-EGO_HALF_SIZE_M = (3.0, 1.1)  # half length and width that the ego vehicle keeps clear, m
+MAX_PEOPLE = 100  # times the usual number; making a street then takes 3 s
+EGO_HALF_SIZE_M = (3.0, 1.1)  # half length and half width that the ego vehicle keeps clear
 
 
 class Scenes(NamedTuple):
-    """Which scenes, see make_scene: all kinds, or one; how many times as many people as usual;
-    scene: one of SCENES, or several with commas between, in turn from seed to seed."""
+    """A selection of scenes, see make_scene.
+
+    Attributes:
+        kind: One kind of the scene type; None for all.
+        people: Number of people as a multiple of the usual one.
+        scene: One of SCENE_TYPES, or several separated by commas, which alternate with the seed.
+    """
 
     kind: str | None = None
     people: float = 1.0
     scene: str = "street"
 
-    def sorts(self) -> list[SceneType]:
-        """In the order of their turns. InputError for an unknown scene or kind, and people that
-        cannot be."""
+    def scene_types(self) -> list[SceneType]:
+        """Return the scene types in their order. Raise InputError for a value that is not allowed.
+        """
         if not 0 <= self.people <= MAX_PEOPLE:
             raise InputError(f"people = {self.people} must be 0 .. {MAX_PEOPLE}, such as 1")
         names = self.scene.split(",")
@@ -56,8 +61,8 @@ class Scenes(NamedTuple):
 
     @property
     def camera(self) -> bool:
-        """Whether all have a camera that looks ahead, beyond whose image nothing is labelled."""
-        return all(sort.camera for sort in self.sorts())
+        """True if all have a forward camera, which limits the labels to its image."""
+        return all(scene_type.camera for scene_type in self.scene_types())
 
 
 ALL_STREETS = Scenes()
@@ -65,10 +70,18 @@ CROWDED_ZONES = Scenes("zone", 3.0)  # for demos and tests of pedestrian detecto
 
 
 class SceneMoment(NamedTuple):
-    """The scene at one time, as the sensor at position (3,) in the world, which looks along
-    heading, finds it. boxes (K, 7) as in GroundTruth, class_ids (K,) int32, track_ids (K,) int32
-    in 1.., which are also the solids' owners, speeds (K,) m/s over the ground, motion of the
-    sensor."""
+    """A scene at one time, in the sensor's frame.
+
+    Attributes:
+        solids: Solids of all things in sight.
+        position: (3,) position of the sensor in the world, m.
+        heading: Heading of the sensor in the world, rad.
+        boxes: (K, 7), see GroundTruth.
+        class_ids: (K,) int32.
+        track_ids: (K,) int32 from 1 on, which are also the owners of the solids.
+        speeds: (K,) m/s over the ground.
+        motion: Motion of the sensor.
+    """
 
     solids: Solids
     position: np.ndarray
@@ -82,9 +95,11 @@ class SceneMoment(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """Things on a ground, and a sensor that goes its way. Robots and all vehicles stay upright, so
-    that the ground has its slope in the LiDAR frame too. The labelled actors have the track ids
-    1.. in their order. seconds: how long the drive may be."""
+    """Things on a ground, and the trajectory of a sensor.
+
+    Robots and vehicles stay upright, so the ground has its slope in the LiDAR frame too. The
+    labelled actors have the track ids 1, 2, ... in their order. seconds: length of the drive.
+    """
 
     ground: Ground
     actors: tuple[Actor, ...]
@@ -93,7 +108,7 @@ class Scene:
     seconds: float = DRIVE_SECONDS
 
     def sensor_pose(self, t: float, sensor_height: float) -> np.ndarray:
-        """(4, 4) float64 from the sensor's frame after t seconds to the world."""
+        """Return the pose (4, 4) float64 of the sensor in the world after t seconds."""
         along, pose = self.way.at(t), np.eye(4)
         cos, sin = math.cos(along.heading), math.sin(along.heading)
         pose[:2, :2] = (cos, -sin), (sin, cos)
@@ -102,7 +117,7 @@ class Scene:
         return pose
 
     def at(self, t: float, sensor_height: float) -> SceneMoment:
-        """The scene after t seconds, relative to a sensor so high above the ground."""
+        """Return the scene after t seconds, for a sensor at this height above the ground in m."""
         along, pose = self.way.at(t), self.sensor_pose(t, sensor_height)
         sensor, turned = pose[:3, 3].copy(), pose[:3, :3]
         ego = sensor[:2]
@@ -132,8 +147,11 @@ class Scene:
 
     @cached_property
     def _table(self) -> np.ndarray:
-        """One row for every actor. feet: the least height of the ground below what never moves and
-        has no label, which may be too long to stand on a slope; NaN for the rest."""
+        """One row per actor.
+
+        feet: lowest ground below things that never move and have no label, since they may be too
+        long to stand on a slope; NaN for the rest.
+        """
         rows = []
         for a in self.actors:
             x0, y0, z0, x1, y1, z1 = compute_hull(a.thing.parts(0.0))
@@ -156,13 +174,13 @@ class Scene:
         return table
 
     def _climbing(self, flat: np.ndarray) -> np.ndarray:
-        """(n, 3) velocities along the slope of the ground from those (n, 2) in the plane."""
+        """Return velocities (n, 3) along the slope of the ground from those in the plane (n, 2)."""
         slope = np.array([self.ground.slope_x, self.ground.slope_y])
         return np.column_stack([flat, flat @ slope])
 
 
 def _join_parts(made: list[np.ndarray]) -> np.ndarray:
-    """All parts (P,) PART in a row; np.concatenate takes as long as casting them."""
+    """Concatenate parts (P,) PART; np.concatenate takes as long as casting them."""
     whole = np.empty(sum(map(len, made)), PART)
     end = 0
     for one in made:
@@ -172,7 +190,7 @@ def _join_parts(made: list[np.ndarray]) -> np.ndarray:
 
 
 def _compute_corners(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """x and y (A, 4) of the corners of footprints (A, 8) at time 0."""
+    """Return x and y (A, 4) of the corners of footprints (A, 8) at time 0."""
     x, y, heading, length, width = f[:, :5, None].transpose(1, 0, 2)
     ahead, aside = length * np.array([1, 1, -1, -1]), width * np.array([1, -1, 1, -1])
     return (x + np.cos(heading) * ahead - np.sin(heading) * aside,
@@ -181,17 +199,24 @@ def _compute_corners(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0,
                scene: str = "street") -> Scene:
-    """A scene of its own for every seed. kind: one of those of the scene; None draws it by their
-    shares. people: multiplies how many pedestrians, sitting people and cyclists are tried; on
-    streets 1 comes near KITTI's labels, 0 is none. scene: see Scenes.
+    """Make the scene of a seed.
 
-    What is placed later is dropped where it would ever touch what is there already. InputError
-    for a negative seed, people beyond 0 .. MAX_PEOPLE and an unknown scene or kind.
+    Things that would ever touch those placed before them are dropped.
+
+    Args:
+        seed: Seed, 0 or more.
+        kind: Kind of the scene type; None draws one by their shares.
+        people: Multiple of the usual number of pedestrians, sitting people and cyclists that are
+            tried. On streets 1 is close to KITTI's labels; 0 is none.
+        scene: See Scenes.
+
+    Raises:
+        InputError: A value is not allowed.
     """
     if seed < 0:
         raise InputError(f"seed = {seed} must not be negative")
-    sorts = Scenes(kind, people, scene).sorts()
-    chosen = sorts[seed % len(sorts)]
+    types = Scenes(kind, people, scene).scene_types()
+    chosen = types[seed % len(types)]
     rng = np.random.default_rng(seed)
     drawn = str(rng.choice(list(chosen.kinds), p=[k.share for k in chosen.kinds.values()]))
     kind = kind or drawn
@@ -200,7 +225,7 @@ def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0,
 
 def _make_street(rng: np.random.Generator, kind: StreetKind,
                  people: float) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
-    """A street along x, and a car that drives at y = 0."""
+    """Make a street along x, on which a car drives at y = 0."""
     street = draw_street(rng, kind, DRIVE_SECONDS)
     ego = [0.0, 0.0, 0.0, *EGO_HALF_SIZE_M, street.speed, 0.0, np.inf]
     room = Room(DRIVE_SECONDS, np.array([ego]))
@@ -210,8 +235,13 @@ def _make_street(rng: np.random.Generator, kind: StreetKind,
 
 
 class SceneType(NamedTuple):
-    """A sort of scene: its kinds by name, each with the share that it is drawn with; make(rng,
-    kind, people): ground, actors and way; camera: see Scenes."""
+    """A type of scene.
+
+    Attributes:
+        kinds: Kinds by name, each with the share of its being drawn.
+        make: make(rng, kind, people) returns ground, actors and trajectory.
+        camera: It has a forward camera, see Scenes.
+    """
 
     kinds: dict[str, Any]
     make: Callable[[np.random.Generator, Any, float], tuple[Ground, tuple[Actor, ...], Trajectory]]

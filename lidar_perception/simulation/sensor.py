@@ -1,5 +1,4 @@
-"""What a spinning LiDAR is, as numbers: where its rays go and when, and how it is described in a
-file."""
+"""Models of spinning LiDARs: directions and times of their rays, and files that describe them."""
 
 from __future__ import annotations
 
@@ -15,12 +14,12 @@ import yaml
 from lidar_perception.runs.files import read_text, shorten_error
 from lidar_perception.types import SENSOR_HEIGHT, InputError, did_you_mean
 
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where it was built
-MAX_BYTES = 1 << 20  # of a file that describes a sensor
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, if available
+MAX_BYTES = 1 << 20  # of a sensor file
 GOLDEN_RATIO = 0.6180339887498949
 MAX_RATE = 1000.0  # turns a second
 MAX_NOISE = 1.0    # metres
-MAX_BEAMS = 1 << 16  # as many rings as uint16 has
+MAX_BEAMS = 1 << 16  # rings are uint16
 MAX_RAYS = 5_000_000  # in a turn; the densest sensors have 0.5 million. Each takes some 100 bytes
 
 
@@ -28,8 +27,9 @@ MAX_RAYS = 5_000_000  # in a turn; the densest sensors have 0.5 million. Each ta
 class Sensor:
     """A LiDAR that turns about its z axis; angles in radians, lengths in metres.
 
-    InputError for what cannot be: no beams, a height that is not positive, max_range <= min_range,
-    more than MAX_BEAMS beams, or MAX_RAYS rays in a turn.
+    Raises:
+        InputError: A value is impossible, such as no beams, a height that is not positive,
+            max_range <= min_range, more than MAX_BEAMS beams, or MAX_RAYS rays in a turn.
     """
 
     elevations: tuple[float, ...]  # one per beam, descending; ring 0 is the highest
@@ -39,20 +39,20 @@ class Sensor:
     max_range: float = 120.0
     range_noise: float = 0.02      # standard deviation
     rate: float = 10.0             # turns per second
-    reach: float = 50.0            # half of the returns of a surface of brightness 0.1 are lost
+    reach: float = 50.0            # where half of the returns of brightness 0.1 are lost
     silent: float = 0.0            # share of returns whose intensity is 0
-    floor: float = 0.0             # an intensity below this is 0, too
-    dropout: float = 0.005         # share of the returns lost for no reason
+    floor: float = 0.0             # intensities below this are 0
+    dropout: float = 0.005         # share of the returns lost at random
     divergence: float = 2e-3       # full angle of a beam
     pulse: float = 0.75            # two surfaces closer than this give one return between them
     lifts: tuple[float, ...] = ()  # where each beam starts on the z axis; empty: all at 0
     offsets: tuple[float, ...] = ()  # what each beam adds to the range; empty: nothing
     biases: tuple[float, ...] = ()  # what each beam adds to the intensity; empty: nothing
-    fade: tuple[float, float] = (0.0, 0.0)  # from this range on intensity falls so much a metre
+    fade: tuple[float, float] = (0.0, 0.0)  # range, and loss of intensity per metre beyond it
     blocked: tuple[tuple[float, float, float], ...] = ()  # by the vehicle: (first ring, from, to),
-    #                                that ring and all lower ones, counter-clockwise, in degrees;
-    #                                from 0 to 360 all around
-    wander: float = 0.0            # beams look elsewhere in every turn, up to so much lower
+    #                                for it and all lower rings, degrees counter-clockwise; 0 to 360
+    #                                is all around
+    wander: float = 0.0            # beams are lower by up to this, differently in every turn
 
     def __post_init__(self) -> None:
         up = np.asarray(self.elevations, np.float64)
@@ -92,24 +92,27 @@ class Sensor:
 
     @property
     def columns(self) -> int:
-        """Firings in a turn."""
+        """Number of firings in a turn."""
         return round(2 * np.pi / self.azimuth_step)
 
     @property
     def rings(self) -> int:
-        """Beams."""
+        """Number of beams."""
         return len(self.elevations)
 
     def at_turn(self, number: int) -> Sensor:
-        """The sensor as it looks in one turn: the same, unless its beams wander. All move by the
-        same part of wander, and over the turns the parts fill it evenly (golden ratio)."""
+        """Return the sensor in one turn, which differs from turn to turn if its beams wander.
+
+        All beams are lower by the same share of wander. Over the turns the shares are evenly
+        distributed (golden ratio).
+        """
         if not self.wander:
             return self
         lower = self.wander * (number * GOLDEN_RATIO % 1.0)
         return replace(self, elevations=tuple(up - lower for up in self.elevations))
 
     def directions(self) -> np.ndarray:
-        """(columns, rings, 3) float64 unit vectors, counter-clockwise from straight ahead."""
+        """Return unit vectors (columns, rings, 3), float64, counter-clockwise from ahead."""
         azimuth = np.arange(self.columns)[:, None] * (2 * np.pi / self.columns)
         elevation = np.asarray(self.elevations)
         flat = np.cos(elevation)
@@ -117,17 +120,20 @@ class Sensor:
             np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)), axis=-1)
 
     def origins(self) -> np.ndarray:
-        """(rings, 3) float64 m: where the beams start, in the sensor's frame."""
+        """Return the starts of the beams in the sensor's frame, (rings, 3) float64 m."""
         return np.column_stack([np.zeros((self.rings, 2)), self.lifts or np.zeros(self.rings)])
 
     def times(self) -> np.ndarray:
-        """(columns,) float64 seconds since the turn began, 0 <= time < 1 / rate. As on KITTI's car
-        the sensor turns clockwise from the rear, and so looks ahead in the middle of the turn."""
+        """Return seconds since the start of the turn, (columns,) float64, 0 <= time < 1 / rate.
+
+        As on KITTI's car the sensor turns clockwise from the rear, so it points ahead in the
+        middle of the turn.
+        """
         columns = self.columns
         return (columns // 2 - np.arange(columns)) % columns / (columns * self.rate)
 
     def open_rays(self) -> np.ndarray:
-        """(columns, rings) bool: not blocked by the vehicle."""
+        """Return (columns, rings) bool: the ray is not blocked by the vehicle."""
         azimuth, ring = np.arange(self.columns) * (360 / self.columns), np.arange(self.rings)
         free = np.ones((self.columns, self.rings), bool)
         for first, start, end in self.blocked:
@@ -138,9 +144,14 @@ class Sensor:
 
 
 class Motion(NamedTuple):
-    """How the sensor moves while it turns: velocity (3,) m/s in the sensor's frame at the stamp,
-    yaw_rate rad/s, counter-clockwise. stamp: the share of the turn that is over at the stamp,
-    0 start, 1 end. In the middle, as in KITTI, boxes at the stamp fit what is straight ahead."""
+    """Motion of the sensor during a turn.
+
+    Attributes:
+        velocity: (3,) m/s in the sensor's frame at the stamp.
+        yaw_rate: rad/s, counter-clockwise.
+        stamp: Share of the turn before the stamp, 0 .. 1. In the middle, as in KITTI, boxes at the
+            stamp fit objects straight ahead.
+    """
 
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     yaw_rate: float = 0.0
@@ -151,8 +162,11 @@ NO_MOTION = Motion()
 
 
 class Rays(NamedTuple):
-    """All rays of a turn, in the sensor's frame at the stamp (float64): origin and direction
-    (columns, rings, 3), metres and unit vectors; since (columns,) seconds after the stamp."""
+    """All rays of a turn in the sensor's frame at the stamp, float64.
+
+    origin and direction: (columns, rings, 3), m and unit vectors; since: (columns,) seconds after
+    the stamp.
+    """
 
     origin: np.ndarray
     direction: np.ndarray
@@ -160,11 +174,11 @@ class Rays(NamedTuple):
 
 
 def make_rays(sensor: Sensor, motion: Motion = NO_MOTION) -> Rays:
-    """Where the rays start and go while the sensor moves."""
+    """Return the rays of a turn while the sensor moves."""
     since = sensor.times() - motion.stamp / sensor.rate
     moved = since[:, None] * np.asarray(motion.velocity, np.float64)
     direction = sensor.directions()
-    if motion.yaw_rate:  # beams start on the z axis, so that only their directions turn
+    if motion.yaw_rate:  # beams start on the z axis, so only their directions turn
         turned = motion.yaw_rate * since[:, None]
         cos, sin = np.cos(turned), np.sin(turned)
         x, y, z = np.moveaxis(direction, -1, 0)
@@ -174,9 +188,14 @@ def make_rays(sensor: Sensor, motion: Motion = NO_MOTION) -> Rays:
 
 def make_generic_sensor(beams: int, lowest: float, highest: float, azimuth_step: float, rate: float,
                         **fields: Any) -> Sensor:
-    """A sensor of evenly spaced beams; angles in degrees, rate in turns per second, and any other
-    field of Sensor by name. InputError for impossible values."""
-    if beams > MAX_BEAMS:  # before there is a list of them
+    """Return a sensor with evenly spaced beams.
+
+    Angles are in degrees, the rate in turns per second. Other fields of Sensor are given by name.
+
+    Raises:
+        InputError: A value is impossible.
+    """
+    if beams > MAX_BEAMS:  # before the list is made
         raise InputError(f"impossible sensor: {beams} beams must be {MAX_BEAMS} at most")
     if beams > 1 and not lowest < highest:
         raise InputError(f"impossible sensor: lowest {lowest} must be below highest {highest}")
@@ -185,16 +204,21 @@ def make_generic_sensor(beams: int, lowest: float, highest: float, azimuth_step:
 
 
 def load_sensor(path: str | Path) -> Sensor:
-    """The sensor that a YAML file describes: the fields of Sensor by name, all angles in degrees
-    (divergence and wander, too), and a name for people. What is not given has its default;
-    elevations, azimuth_step and rate must be. sensors/*.yaml are examples, and `setup` writes one.
-    InputError, which names the file, where it is no such description, or an impossible one."""
+    """Load a sensor from a YAML file.
+
+    The file has the fields of Sensor by name, with all angles in degrees (also divergence and
+    wander), and optionally a name. elevations, azimuth_step and rate are required. Examples are
+    sensors/*.yaml; `setup` writes such a file.
+
+    Raises:
+        InputError: The file is no sensor file, or describes an impossible sensor.
+    """
     remedy = "see config/sensors/ for examples, or measure one with 'lidar-perception setup'"
     text = read_text(path, MAX_BYTES)
     try:
         content = yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
-        raise InputError(f"{path} is no YAML: {shorten_error(error)}") from None
+        raise InputError(f"{path} is not YAML: {shorten_error(error)}") from None
     if not isinstance(content, dict):
         raise InputError(f"{path} describes no sensor; {remedy}")
     values = {key: value for key, value in content.items() if key != "name"}
@@ -211,12 +235,12 @@ def load_sensor(path: str | Path) -> Sensor:
 
 
 FIELD_SHAPES = {"elevations": (0,), "lifts": (0,), "offsets": (0,), "biases": (0,), "fade": (2,),
-                "blocked": (0, 3)}  # of the fields that are no single number; 0: any length
+                "blocked": (0, 3)}  # of fields that are lists; 0: any length
 DEGREE_FIELDS = ("elevations", "azimuth_step", "divergence", "wander")
 
 
 def _convert_field(key: str, value: Any) -> Any:
-    """A value of the file in the unit of the field; InputError where it is of the wrong kind."""
+    """Convert a value of the file to the unit of its field. Raise InputError for a wrong type."""
     shape = FIELD_SHAPES.get(key, ())
     if value == [] and shape[:1] == (0,):
         return ()
@@ -240,12 +264,12 @@ def _are_whole(numbers: np.ndarray) -> bool:
 
 
 def _normalize_name(name: str) -> str:
-    """A sensor's name without what people write in different ways."""
+    """Return a sensor's name in lower case without punctuation."""
     return "".join(c for c in name.lower() if c.isalnum())
 
 
 PRESET_FILES = {_normalize_name(path.stem): path for path in sorted(
-    (Path(__file__).parent / "sensors").glob("*.yaml"))}  # described by files of the package
+    (Path(__file__).parent / "sensors").glob("*.yaml"))}  # files of the package
 
 
 @cache
@@ -254,14 +278,17 @@ def _load_preset(key: str) -> Sensor:
 
 
 HDL64E = _load_preset("hdl64e")
-SENSORS: dict[str, Sensor] = {"hdl64e": HDL64E}  # and those of READY
+SENSORS: dict[str, Sensor] = {"hdl64e": HDL64E}  # and those of PRESET_FILES
 SENSOR_NAMES = tuple(path.stem for path in PRESET_FILES.values())
 GENERIC_FORMAT = "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE (degrees, turns a second)"
 
 
 def make_hdl64e(rate: float = 10.0) -> Sensor:
-    """KITTI's HDL-64E S2 at so many turns per second, 5 to 20: the lasers fire at a fixed rate, so
-    that a slower turn is a finer one. InputError for another rate."""
+    """Return KITTI's HDL-64E S2 at a rate of 5 to 20 turns per second.
+
+    The lasers fire at a fixed rate, so a slower turn has a finer azimuth step. Raises InputError
+    for another rate.
+    """
     if not 5 <= rate <= 20:
         raise InputError(f"impossible sensor: rate {rate} must be 5 .. 20 turns per second")
     columns = round(HDL64E.columns * HDL64E.rate / rate)
@@ -269,9 +296,16 @@ def make_hdl64e(rate: float = 10.0) -> Sensor:
 
 
 def find_sensor(name: str, height: float = 0.0) -> Sensor:
-    """The sensor of a YAML file (see load_sensor), the one of that name, however it is
-    written (vlp-16, VLP16), or a generic one as GENERIC says; at another height above the ground if
-    that is not 0, metres. InputError, which names them all, for anything else."""
+    """Return the sensor of a name, which may be a preset, a YAML file or a generic sensor.
+
+    Args:
+        name: Preset in any spelling (vlp-16, VLP16), YAML file (see load_sensor), or generic sensor
+            (see GENERIC_FORMAT).
+        height: Height above the ground in m; 0 keeps that of the sensor.
+
+    Raises:
+        InputError: There is no such sensor; the message lists the presets.
+    """
     sensor = _find_by_name(name)
     return replace(sensor, height=height) if height else sensor
 
@@ -280,7 +314,7 @@ def _find_by_name(name: str) -> Sensor:
     if name.startswith("generic:"):
         try:
             beams, *numbers = map(float, name.removeprefix("generic:").split(","))
-            if beams % 1:  # NaN is no whole number, either
+            if beams % 1:  # also true for NaN
                 raise ValueError
             return make_generic_sensor(int(beams), *numbers)
         except (TypeError, ValueError, OverflowError) as error:

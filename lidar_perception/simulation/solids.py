@@ -1,4 +1,4 @@
-"""Things as solids: unit shapes under a linear map, with what their surface and owner are."""
+"""Solids: unit shapes under a linear map, with their surface and owner."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from numba import njit
 BOX, ELLIPSOID, CYLINDER = 0, 1, 2  # a cylinder stands along its z axis
 
 # One part of a thing, in the thing's frame: x forward, y left, z up from the ground below its
-# origin; metres, radians. half: half sizes along its own axes, which are turned by pitch about y
-# (positive: nose down), then by yaw about z.
-# semantic: SemanticKITTI class. reflectance 0..1; RETROREFLECTOR sends beams back where they come
-# from, is as bright from anywhere and does not fade. density 1/m: inf is solid; foliage lets a beam
-# through for 1 / density metres in the mean. transmission: share of the beams that pass, as through
-# glass.
+# origin; metres, radians.
+# half: half sizes along the part's axes, which are turned by pitch about y (positive: nose down),
+# then by yaw about z.
+# semantic: SemanticKITTI class.
+# reflectance: 0..1; a RETROREFLECTOR is equally bright from all directions and does not fade.
+# density: 1/m; inf is solid; a beam passes through foliage for 1 / density metres in the mean.
+# transmission: share of the beams that pass, as through glass.
 RETROREFLECTOR = 1.0
 PART = np.dtype([("kind", np.int8), ("centre", np.float64, 3), ("half", np.float64, 3),
                  ("pitch", np.float64), ("yaw", np.float64), ("reflectance", np.float64),
@@ -25,7 +26,7 @@ PART = np.dtype([("kind", np.int8), ("centre", np.float64, 3), ("half", np.float
 
 
 class Surface(TypedDict, total=False):
-    """What several parts are made of, see PART: arguments of part()."""
+    """Surface that several parts share: arguments of part(), see PART."""
 
     reflectance: float
     transmission: float
@@ -34,12 +35,12 @@ class Surface(TypedDict, total=False):
 def part(kind: int, centre: tuple, half: tuple, *, pitch: float = 0.0, yaw: float = 0.0,
          reflectance: float = 0.3, semantic: int = 0, density: float = np.inf,
          transmission: float = 0.0) -> tuple:
-    """A row of PART; semantic 0 takes the class of its thing."""
+    """Return a row of PART; semantic 0 takes the class of its thing."""
     return kind, centre, half, pitch, yaw, reflectance, semantic, density, transmission
 
 
 def parts(rows: list[tuple], semantic: int) -> np.ndarray:
-    """(P,) PART of a thing; rows without a class of their own get this one."""
+    """Return the rows of a thing as (P,) PART; rows without a class get this one."""
     made = np.array(rows, PART)
     made["semantic"] = np.where(made["semantic"] == 0, semantic, made["semantic"])
     return made
@@ -47,11 +48,18 @@ def parts(rows: list[tuple], semantic: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Solids:
-    """P solids in the sensor's frame at the stamp: kind (P,) int8, centre (P, 3) m, half (P, 3) m,
-    axes (P, 3, 3) with the solid's axes as columns, reflectance (P,), semantic (P,) uint16,
-    density (P,) 1/m, transmission (P,), see PART; owner (P,) int32: the object that it belongs to,
-    0 if none; velocity (P, 3) m/s over the ground, in the axes of the sensor's frame.
-    The solids of an object stand together."""
+    """P solids in the sensor's frame at the stamp; those of an object are consecutive.
+
+    Attributes:
+        kind: (P,) int8.
+        centre, half: (P, 3) m.
+        axes: (P, 3, 3), the solid's axes as columns.
+        reflectance, transmission: (P,), see PART.
+        semantic: (P,) uint16.
+        density: (P,) 1/m.
+        owner: (P,) int32 object, 0 for none.
+        velocity: (P, 3) m/s over the ground, in the axes of the sensor's frame.
+    """
 
     kind: np.ndarray
     centre: np.ndarray
@@ -68,13 +76,16 @@ class Solids:
         return len(self.kind)
 
     def take(self, places: np.ndarray) -> Solids:
+        """Return the solids at these indices."""
         return Solids(*(getattr(self, f.name)[places] for f in fields(self)))
 
 
 def place_parts(made: np.ndarray, base: np.ndarray, heading: np.ndarray, owner: np.ndarray,
                 velocity: np.ndarray) -> Solids:
-    """The solids of parts (P,) PART of things that stand at base (P, 3) and look along heading
-    (P,); owner (P,) and velocity (P, 3) are copied."""
+    """Return the solids of parts (P,) PART of things at base (P, 3) with heading (P,) in rad.
+
+    owner (P,) and velocity (P, 3) are copied.
+    """
     cos, sin = np.cos(made["yaw"] + heading), np.sin(made["yaw"] + heading)
     down, nose = np.cos(made["pitch"]), np.sin(made["pitch"])
     zero = np.zeros(len(made))
@@ -90,15 +101,17 @@ def place_parts(made: np.ndarray, base: np.ndarray, heading: np.ndarray, owner: 
 
 
 def compute_extents(made: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 3) lower and (P, 3) upper bounds of each part, exact, in the thing's frame."""
+    """Return exact lower and upper bounds of each part, (P, 3) each, in the thing's frame."""
     low, high = np.empty((len(made), 3)), np.empty((len(made), 3))
     _extents(made, low, high)
     return low, high
 
 
 def compute_hull(made: np.ndarray, below: float = np.inf) -> tuple[float, ...]:
-    """Bounds of all parts (P,) PART of which something is lower than that: least x, y, z, greatest
-    x, y, z, in the thing's frame; inf and -inf where there are none."""
+    """Return the bounds of all parts that reach below a height, in the thing's frame.
+
+    They are least x, y, z and greatest x, y, z; inf and -inf without such parts.
+    """
     return _hull(made, below)
 
 
@@ -125,7 +138,7 @@ def _hull(made, below):
 
 @njit(cache=True, nogil=True)
 def _reach(one):
-    """How far a part reaches along x, y, z from its centre."""
+    """Return how far a part reaches along x, y and z from its centre."""
     cos, sin, down, nose = (math.cos(one.yaw), math.sin(one.yaw), math.cos(one.pitch),
                             math.sin(one.pitch))
     a, b, c = one.half[0], one.half[1], one.half[2]
@@ -136,7 +149,7 @@ def _reach(one):
 
 @njit(cache=True, nogil=True)
 def _along(kind, a, b, c):
-    """Half the extent of a part whose half axes reach so far in a direction."""
+    """Return half the extent of a part in a direction, given the extents of its half axes."""
     if kind == ELLIPSOID:
         return math.sqrt(a * a + b * b + c * c)
     if kind == CYLINDER:

@@ -1,4 +1,4 @@
-"""Kinds of streets, and how their lanes, sidewalks and side streets lie."""
+"""Kinds of streets, and the layout of their lanes, sidewalks and side streets."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from lidar_perception.simulation.places import Side
 from lidar_perception.simulation.terrain import Ground
 
-BEHIND_M, AHEAD_M = 100.0, 130.0  # metres of street behind the start and beyond the end of a drive
+BEHIND_M, AHEAD_M = 100.0, 130.0  # street behind the start and beyond the end of a drive
 CORNER_WALK_M = 2.5                  # sidewalk along a side street, m
 ARM_LENGTH_M = 60.0                    # length of a side street, m
 # Widths of parking strips: cars along the curb, or nose to it.
@@ -19,11 +19,14 @@ PARALLEL_STRIP_M, ACROSS_STRIP_M = 2.2, 5.0
 
 @dataclass(frozen=True)
 class StreetKind:
-    """Ranges (low, high) are drawn from uniformly; lengths in metres, speeds in m/s; shares,
-    chances and the weights of fronts are in 0 .. 1; rates count per 100 m."""
+    """A kind of street.
 
-    share: float                      # how often it is drawn, a choice
-    fronts: dict[str, float]          # what lines a side (roadside.py), and how often
+    Ranges (low, high) are drawn from uniformly. Lengths are in m, speeds in m/s, rates per 100 m;
+    shares, chances and weights of fronts are 0 .. 1.
+    """
+
+    share: float                      # of the streets, a choice
+    fronts: dict[str, float]          # weights of what lines a side, see roadside.py
     lane: tuple[float, float] = (3.0, 3.5)
     beside: tuple[int, int] = (0, 1)  # how many more lanes in our direction, high excluded
     oncoming: tuple[int, int] = (1, 2)
@@ -71,7 +74,7 @@ STREET_KINDS = {
 
 
 class Lane(NamedTuple):
-    """A lane with its middle line at y; direction 1 along x or -1; use: road, rail or cycle."""
+    """A lane with its centre line at y; direction: 1 or -1 along x; use: road, rail or cycle."""
 
     y: float
     direction: int
@@ -80,8 +83,11 @@ class Lane(NamedTuple):
 
 
 class Street(NamedTuple):
-    """What lay_out drew. blocks: sides between the crossings; arms: sides of the side streets.
-    speed of the ego vehicle."""
+    """A street from draw_street.
+
+    blocks: sides between the crossings; arms: sides of the side streets; speed: of the ego vehicle;
+    start, end: x of both ends.
+    """
 
     kind: StreetKind
     ground: Ground
@@ -94,7 +100,7 @@ class Street(NamedTuple):
 
 
 def draw_street(rng: np.random.Generator, kind: StreetKind, seconds: float) -> Street:
-    """A street long enough for a drive of so many seconds."""
+    """Draw a street long enough for a drive of this duration."""
     speed = 0.0 if rng.random() < kind.stands else rng.uniform(*kind.speed)
     start, end = -BEHIND_M, speed * seconds + AHEAD_M
     parking = 0.0
@@ -103,7 +109,7 @@ def draw_street(rng: np.random.Generator, kind: StreetKind, seconds: float) -> S
     lanes, right, left = _draw_lanes(rng, kind, speed, parking)
     walk, crossings = rng.uniform(*kind.walk), _draw_crossings(rng, kind, start, end)
     # Slopes of 27 scans of KITTI: 0.67 +- 0.2 degrees ahead (the sensor's own pitch), +- 0.45
-    # aside. Heights of grass and litter are such that cells of 1 m beside the road scatter about
+    # aside. With these heights of grass and litter, cells of 1 m next to the road scatter about
     # their planes as on KITTI: 5 to 40 m away 3 to 5 cm at the upper quartile, 36 to 52 % of them
     # more than 1 cm (real: 42 to 49). Wave, camber and reflectances are guesses.
     slope_x, slope_y = np.tan(np.radians(rng.normal((0.6, 0.05), (0.25, 0.4))))
@@ -113,7 +119,7 @@ def draw_street(rng: np.random.Generator, kind: StreetKind, seconds: float) -> S
                     parking=parking, rough=rng.uniform(0.2, 0.8),
                     road=rng.uniform(0.23, 0.38), sidewalk=rng.uniform(0.33, 0.48),
                     grass=rng.uniform(0.3, 0.4))
-    ground = ground._replace(litter=ground.rough - 0.2)  # where grass is high, nobody sweeps
+    ground = ground._replace(litter=ground.rough - 0.2)  # high grass comes with unswept pavement
     names, weights = list(kind.fronts), list(kind.fronts.values())
     fronts = rng.choice(names, 2, p=weights)
     edges = [start, *np.ravel(crossings), end]
@@ -131,7 +137,7 @@ def draw_street(rng: np.random.Generator, kind: StreetKind, seconds: float) -> S
 
 def _draw_lanes(rng, kind: StreetKind, speed: float,
                 parking: float) -> tuple[tuple[Lane, ...], float, float]:
-    """The lanes, ours first, and the curbs right and left of them."""
+    """Draw the lanes, the ego vehicle's first, and the y of the right and left curbs."""
     width = rng.uniform(*kind.lane)
     lanes, right = [Lane(0.0, 1, speed)], -width / 2
     for _ in range(rng.integers(*kind.beside)):
@@ -158,7 +164,7 @@ def _draw_lane_speed(rng, kind: StreetKind) -> float:
 
 def _draw_crossings(rng, kind: StreetKind, start: float,
                     end: float) -> tuple[tuple[float, float], ...]:
-    """x intervals of side streets; none at the very ends."""
+    """Draw x intervals of side streets, not near the ends."""
     found, x = [], start + rng.uniform(0.1, 1.0) * kind.crossing[1]
     while x < end - 20:
         width = rng.uniform(5.5, 7.0) + 2 * PARALLEL_STRIP_M * (rng.random() < kind.parking)
@@ -169,13 +175,15 @@ def _draw_crossings(rng, kind: StreetKind, start: float,
 
 def _make_arm(front: str, x: float, land: int, curb: float, up: int, walk: float,
               parking: float) -> Side:
-    """The side of a side street at x, with its land towards land * x, that leaves the street from
-    behind the houses at its curb towards up * y."""
+    """Return one side of a side street at x, which begins behind the houses at a curb.
+
+    It leads towards up * y, and its front is on the side land * x.
+    """
     near = curb + up * (walk + 9.0)
     return Side(x, near if up == -land else near + up * ARM_LENGTH_M, -land * np.pi / 2,
                 ARM_LENGTH_M, CORNER_WALK_M, str(front), parking)
 
 
 def parking_width(crossing: tuple[float, float]) -> float:
-    """The width of the parking strips on both sides of a side street."""
+    """Return the width of the parking strips of a side street, in m."""
     return PARALLEL_STRIP_M if crossing[1] - crossing[0] > 8.0 else 0.0

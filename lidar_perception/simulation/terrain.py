@@ -1,10 +1,9 @@
-"""The ground: a road that slopes, waves and falls to its curbs, side streets that cross it, and
-beyond the curbs sidewalks, then grass.
+"""The ground: a sloping road with waves and camber, side streets, and sidewalks and grass beyond.
 
 It is a smooth relief in the world (x along the street, y left, z up, metres), raised by the height
-of the curb beyond the curbs. A ray is above both the relief and the raised relief until it meets
-the latter; there it is at its end, or from there on it meets a curb or the road. Before that it may
-meet what lies and grows there: bumps everywhere, tufts and litter in patches.
+of the curb beyond the curbs. A ray is above both the relief and the raised relief until it hits the
+latter. There it ends, or it continues to a curb or the road. Before that it may hit bumps, which
+are everywhere, and tufts and litter in patches.
 """
 
 from __future__ import annotations
@@ -29,14 +28,17 @@ MAX_TUFT_DISTANCE_M, TUFT_STEPS = 6.0, 8  # length of a grazing ray that is sear
 
 
 class Ground(NamedTuple):
-    """Metres; see the module. The relief is slope_x x + slope_y y
-    + wave sin(2 pi x / wavelength) cos(2 pi y / wavelength), less the camber."""
+    """A ground, in metres, see the module.
+
+    The relief is slope_x x + slope_y y + wave sin(2 pi x / wavelength) cos(2 pi y / wavelength),
+    minus the camber.
+    """
 
     slope_x: float = 0.0
     slope_y: float = 0.0
     wave: float = 0.0
     wavelength: float = 25.0
-    camber: float = 0.0       # fall per metre from the road's middle line to both curbs
+    camber: float = 0.0       # fall per metre from the centre line to both curbs
     curb_left: float = 1e9    # y of the curbs
     curb_right: float = -1e9
     curb_height: float = 0.0
@@ -44,18 +46,20 @@ class Ground(NamedTuple):
     crossings: tuple[tuple[float, float], ...] = ()  # x intervals of side streets, without a curb
     parking: float = 0.0      # width of the parking strip inside each curb
     rough: float = 0.0        # greatest height of tufts of grass; PAVED of it on the road
-    litter: float = 0.0       # likewise of what lies and grows on sidewalks and parking strips
+    litter: float = 0.0       # greatest height of bumps on sidewalks and parking strips
     road: float = 0.3         # reflectances
     sidewalk: float = 0.4
     grass: float = 0.35
 
 
-PAVEMENT = Ground(curb_left=-1e6, curb_right=-1e6 - 1)  # level, and all of it a sidewalk
+PAVEMENT = Ground(curb_left=-1e6, curb_right=-1e6 - 1)  # level, all of it sidewalk
 
 
 class GroundHit(NamedTuple):
-    """What a ray meets of the ground: range m, inf where nothing; brightness and cosine of the
-    incidence, 0 where nothing; semantic class, 0 where nothing."""
+    """Hit of a ray on the ground: range in m, brightness, cosine of the incidence, and class.
+
+    Without a hit the range is inf and the rest 0.
+    """
 
     range: float
     brightness: float
@@ -65,19 +69,22 @@ class GroundHit(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def compute_brightness(reflectance, cosine):
-    """Brightness, much softer than Lambert's law: on KITTI's scans the road has the same intensity
-    at 20 m, where the rays graze it, as at 6 m. A retroreflector is as bright from anywhere."""
+    """Return the brightness of a surface, less dependent on the incidence than Lambert's law.
+
+    On KITTI's scans the road has the same intensity at 20 m, at grazing incidence, as at 6 m. A
+    retroreflector is equally bright from all directions.
+    """
     return reflectance * (1 - 0.25 * (1 - cosine) * (reflectance < RETROREFLECTOR))
 
 
 def to_compiled(ground: Ground) -> Ground:
-    """The same for compiled code: numbers, and crossings as an array (C, 2)."""
+    """Return the ground for compiled code, with crossings as an array (C, 2)."""
     return Ground._make(np.array(value, np.float64).reshape(-1, 2) if name == "crossings"
                         else float(value) for name, value in ground._asdict().items())
 
 
 def surface_height(ground: Ground, x, y) -> np.ndarray:
-    """Height of what one stands on at x, y (arrays), without roughness: road, sidewalk, grass."""
+    """Return the height of road, sidewalk or grass at x, y (arrays) in m, without roughness."""
     x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
     return _heights(to_compiled(ground), x.ravel(), y.ravel()).reshape(x.shape)
 
@@ -94,8 +101,10 @@ def _heights(ground, x, y):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cast_ground(ground, start, way, max_range):
-    """The GroundHit of a ray, start and way (x, y, z) in the world, that starts above the road,
-    with a compiled ground within max_range."""
+    """Return the GroundHit of a ray that starts above the road.
+
+    ground: from to_compiled; start, way: (x, y, z) in the world; max_range: m.
+    """
     nothing = GroundHit(np.inf, 0.0, 0.0, 0)
     if not way[2] - ground.slope_x * way[0] - ground.slope_y * way[1] < -1e-3:
         return nothing
@@ -104,7 +113,7 @@ def cast_ground(ground, start, way, max_range):
         t, edge = _intersect_raised(ground, start, way, t, max_range)
     if not t <= max_range:
         return nothing
-    cosine = edge  # that at a curb, where one is met
+    cosine = edge  # at a curb, if one is hit
     if not edge:
         _, slope_x, slope_y = _relief(ground, start[0] + t * way[0], start[1] + t * way[1])
         cosine = min(max(slope_x * way[0] + slope_y * way[1] - way[2], 1e-3), 1.0)
@@ -118,27 +127,29 @@ def cast_ground(ground, start, way, max_range):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def min_ground_range(ground, start, way):
-    """A range, as cheap as can be, before which the ray of cast_ground meets nothing; inf where it
-    does not fall."""
+    """Return a range, cheap to compute, before which a ray does not hit the ground.
+
+    inf if the ray does not descend.
+    """
     closing = ground.slope_x * way[0] + ground.slope_y * way[1] - way[2]
     if closing <= 1e-3:
         return np.inf
     height = start[2] - ground.slope_x * start[0] - ground.slope_y * start[1] - abs(ground.wave)
-    height -= ground.curb_height + 0.01  # Newton's method stops within less of the relief
+    height -= ground.curb_height + 0.01  # Newton's method stops nearer to the relief
     tall = max(ground.rough, ground.litter)
     return max((height - tall) / closing, height / closing - MAX_TUFT_DISTANCE_M)
 
 
 @njit(cache=True, nogil=True)
 def _stays_on_road(ground, start, way, t):
-    """Whether a ray is between the curbs up to range t."""
+    """Return True if a ray is between the curbs up to range t."""
     y, end = start[1], start[1] + t * way[1]
     return ground.curb_right < min(y, end) and max(y, end) < ground.curb_left
 
 
 @njit(cache=True, nogil=True)
 def _relief(ground, x, y):
-    """Height and slopes along x and y at x, y, without curbs."""
+    """Return height and slopes along x and y at x, y, without curbs."""
     middle, half = (ground.curb_left + ground.curb_right) / 2, (
         ground.curb_left - ground.curb_right) / 2
     aside = y - middle
@@ -158,7 +169,7 @@ def _relief(ground, x, y):
 
 @njit(cache=True, nogil=True)
 def _is_in_side_street(ground, x):
-    """Whether x lies in a side street."""
+    """Return True if x is in a side street."""
     for i in range(len(ground.crossings)):
         if ground.crossings[i, 0] < x < ground.crossings[i, 1]:
             return True
@@ -167,27 +178,26 @@ def _is_in_side_street(ground, x):
 
 @njit(cache=True, nogil=True)
 def _is_raised(ground, x, y):
-    """Whether x, y lie beyond the curbs and in no side street."""
+    """Return True if x, y is beyond the curbs and in no side street."""
     return (y <= ground.curb_right or y >= ground.curb_left) and not _is_in_side_street(ground, x)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _intersect_relief(ground, start, way, lift, t, max_range):
-    """Range of the relief raised by lift, searched from t by Newton's method; inf if none."""
+    """Return the range of the relief raised by lift, by Newton's method from t; inf if none."""
     for _ in range(10):
         height, slope_x, slope_y = _relief(ground, start[0] + t * way[0], start[1] + t * way[1])
         gap = start[2] + t * way[2] - height - lift
         closing = slope_x * way[0] + slope_y * way[1] - way[2]
         t = min(max(t + gap / max(closing, 1e-4), 0.0), 2 * max_range)
-        if abs(gap) <= 1e-4:  # what is left after that step is far less
+        if abs(gap) <= 1e-4:  # the remaining error is far smaller
             return t
     return np.inf
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _intersect_raised(ground, start, way, low, max_range):
-    """Range with the curbs, given that of the relief, and the cosine where a curb is met, else
-    0."""
+    """Return the range with curbs, given that of the relief, and the cosine at a curb, else 0."""
     high = _intersect_relief(ground, start, way, ground.curb_height, min(low, max_range), max_range)
     if high < np.inf and _is_raised(ground, start[0] + high * way[0], start[1] + high * way[1]):
         return high, 0.0
@@ -198,7 +208,7 @@ def _intersect_raised(ground, start, way, low, max_range):
             axis, line = 0, ground.crossings[(i - 2) // 2, i % 2]
         at = (line - start[axis]) / way[axis]
         if high < at < t:
-            beyond = at + 1e-4  # a hair
+            beyond = at + 1e-4
             if _is_raised(ground, start[0] + beyond * way[0], start[1] + beyond * way[1]):
                 t, edge = at, abs(way[axis])
     return t, edge
@@ -206,21 +216,23 @@ def _intersect_raised(ground, start, way, low, max_range):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _intersect_tufts(ground, start, way, t, cosine):
-    """Range of the first tuft or bump met before the ground at t, else t: looked for where a ray is
-    low enough, from the sensor on, in TUFT_STEPS steps; 0 where it starts in one."""
+    """Return the range of the first tuft or bump before the ground at t, else t.
+
+    The low end of the ray is searched in TUFT_STEPS steps. 0 if the ray starts in a tuft.
+    """
     step = min(max(ground.rough, ground.litter) / cosine, MAX_TUFT_DISTANCE_M) / TUFT_STEPS
     end, begin = start[1] + t * way[1], start[1] + (t - TUFT_STEPS * step) * way[1]
     left, right = ground.curb_left - ground.parking, ground.curb_right + ground.parking
     first = TUFT_STEPS - 1
     if max(end, begin) <= left and min(end, begin) >= right:
-        first = 0  # the road itself is nowhere as high
+        first = 0  # bumps on the road are lower
     for k in range(first, -1, -1):
         back = k * step
         if back >= t:
             continue  # behind the sensor
         top = tuft_height(ground, start[0] + (t - back) * way[0], start[1] + (t - back) * way[1],
                           back * cosine)
-        above = top / cosine  # the ray is as high so far before t
+        above = top / cosine  # the ray has this height at this distance before t
         if above > back:
             return max(t - min(above, back + step), 0.0)
     return t
@@ -228,8 +240,10 @@ def _intersect_tufts(ground, start, way, t, cosine):
 
 @njit(cache=True, nogil=True)
 def tuft_height(ground, x, y, least):
-    """Height of what grows and lies at x, y, in patches with nearly bare ground between; 0 where it
-    is surely not above least."""
+    """Return the height of tufts and bumps at x, y: patches with nearly bare ground between.
+
+    0 if it is certainly not above least.
+    """
     patch = min(max((_bumps(x / PATCH, y / PATCH) - BARE_SHARE) * PATCH_STEEPNESS,
                     BARE_HEIGHT_SHARE), 1.0)
     if not patch * max(ground.rough, ground.litter) > least:
@@ -241,7 +255,7 @@ def tuft_height(ground, x, y, least):
 
 @njit(cache=True, nogil=True)
 def _surface(ground, x, y):
-    """Class and reflectance of the ground at x, y."""
+    """Return class and reflectance of the ground at x, y."""
     beyond = max(y - ground.curb_left, ground.curb_right - y)
     if _is_in_side_street(ground, x):
         return ROAD, ground.road
@@ -252,7 +266,7 @@ def _surface(ground, x, y):
 
 @njit(cache=True, nogil=True)
 def _bumps(x, y):
-    """0 .. 1 at x, y: value noise, the same at a place for ever."""
+    """Return value noise at x, y, 0 .. 1, which is constant in time."""
     x, y = x / GRAIN_M, y / GRAIN_M
     left, low = math.floor(x), math.floor(y)
     place = (np.int64(left) << 32) + np.int64(low)

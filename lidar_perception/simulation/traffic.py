@@ -1,4 +1,4 @@
-"""Who drives, parks, rides, walks, stands and sits in a street."""
+"""Vehicles, cyclists and people of a street, moving, parked, standing or sitting."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from lidar_perception.simulation.street import (
     parking_width,
 )
 
-DRAWBAR_M = 0.8  # between a car and what it pulls, m
-FREE_CORNER_M = 5.0     # nobody parks so near to a crossing, m
-OTHER_VEHICLE = 20  # of SemanticKITTI
+DRAWBAR_M = 0.8  # between a car and its trailer
+FREE_CORNER_M = 5.0  # without parked vehicles, at a crossing
+OTHER_VEHICLE = 20  # SemanticKITTI class
 
 
 def populate(rng: np.random.Generator, street: Street, room: Room, people: float) -> None:
-    """Everybody who has a label, and bicycles and motorcycles that nobody rides."""
+    """Add all labelled actors, and parked bicycles and motorcycles."""
     kind, blocks = street.kind, street.blocks
     for lane in street.lanes:
         for group in _queue_vehicles(rng, lane, street, room.seconds):
@@ -56,8 +56,10 @@ def populate(rng: np.random.Generator, street: Street, room: Room, people: float
 
 
 def _draw_vehicles(rng, use: str) -> list[Thing]:
-    """What comes along a lane, the first ahead of what it pulls; shares set by trial, so that
-    the labels of many scenes come near KITTI's."""
+    """Draw a vehicle of a lane, with its trailer if any.
+
+    The shares are tuned so that the labels of many scenes are close to KITTI's.
+    """
     if use == "rail":
         return [make_tram(rng)]
     pick = rng.random()
@@ -67,7 +69,7 @@ def _draw_vehicles(rng, use: str) -> list[Thing]:
 
 
 def make_trailer(rng) -> Thing:
-    """A trailer with a closed load behind a car, on one axle."""
+    """Make a closed single-axle trailer."""
     length, width, height = size = tuple(rng.uniform((1.8, 1.3, 0.9), (3.8, 1.9, 2.3)).tolist())
     x, y = length / 2, width / 2
     rows = [block((-x, -y, 0.35), (x, y, height), reflectance=rng.uniform(0.1, 0.5)),
@@ -76,11 +78,12 @@ def make_trailer(rng) -> Thing:
 
 
 def _queue_vehicles(rng, lane: Lane, street: Street, seconds: float) -> Iterator[list[Actor]]:
-    """The vehicles of a lane that are ever in sight; nobody tailgates the ego vehicle."""
+    """Yield the vehicles of a lane that are ever in sight, none close to the ego vehicle."""
     if lane.use == "cycle":
         return
     ours, way = lane is street.lanes[0], lane.direction
-    past = (street.speed - way * lane.speed) * seconds  # how far we get ahead of the lane
+    # Distance by which the ego vehicle gets ahead of the lane.
+    past = (street.speed - way * lane.speed) * seconds
     x, last = sorted((-way * SIGHT_M, way * SIGHT_M))
     x, last = x + min(past, 0.0), last + max(past, 0.0)
     stop_lines = [25.0] if ours else [edge[way < 0] for edge in street.ground.crossings]
@@ -111,7 +114,7 @@ def _queue_vehicles(rng, lane: Lane, street: Street, seconds: float) -> Iterator
 
 
 def _fill_side_street(rng, crossing: tuple[float, float], ground) -> Iterator[Actor]:
-    """Cars that wait for us, drive away or pass our street."""
+    """Yield cars that wait at the street, drive away from it or cross it."""
     low, high = crossing
     strip = parking_width(crossing)
     quarter = (high - low - 2 * strip) / 4 + strip
@@ -130,7 +133,7 @@ def _fill_side_street(rng, crossing: tuple[float, float], ground) -> Iterator[Ac
 
 
 def _park_vehicles(rng, side: Side, taken: float) -> Iterator[Actor]:
-    """Rows along the curb, cars in drives, and now and then a car park behind the sidewalk."""
+    """Yield rows along the curb, cars in driveways, and some car parks behind the sidewalk."""
     def vehicle():
         pick = rng.random()
         if pick < 0.965:
@@ -163,7 +166,7 @@ def _park_vehicles(rng, side: Side, taken: float) -> Iterator[Actor]:
 
 
 def _place_seats(rng, side: Side, rate: float, people: float) -> Iterator[list[Actor]]:
-    """A bench with its back to the wall, and who sits there; chairs of cafes."""
+    """Yield benches with their backs to the wall and people on them, and cafe chairs."""
     for along in scatter(rng, side.length, 8 * rate):
         out, turn = max(side.walk - 0.7, 1.5), -np.pi / 2
         sitters = [side.put(make_sitting_person(rng, chair=False), along + aside, out, turn)
@@ -177,7 +180,7 @@ def _place_seats(rng, side: Side, rate: float, people: float) -> Iterator[list[A
 
 
 def _place_riders(rng, street: Street, seconds: float, people: float) -> Iterator[Actor]:
-    """Cyclists at the edges of the road, on the sidewalks and across; parked two-wheelers."""
+    """Yield cyclists at the edges of the road, on sidewalks and crossings, and parked bicycles."""
     ground, kind = street.ground, street.kind
     lanes = [lane for lane in street.lanes if lane.use == "cycle"]
     places = [(lane.y, lane.direction) for lane in lanes] or [
@@ -203,7 +206,7 @@ def _place_riders(rng, street: Street, seconds: float, people: float) -> Iterato
 
 
 def _find_crosswalks(street: Street) -> list[Side]:
-    """The sidewalks of the side streets, and on across our street."""
+    """Return the sidewalks of the side streets, continued across the street."""
     far = 40.0
     return [Side(x, land * far, -land * np.pi / 2, 2 * far, CORNER_WALK_M, "")
             for crossing in street.ground.crossings for x, land in zip(crossing, (-1, 1))]

@@ -1,4 +1,4 @@
-"""The way of the sensor: ahead along x at a steady speed, swaying to both sides."""
+"""Trajectory of the sensor: ahead along x at constant speed, swaying to both sides."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-DRIVE_SECONDS = 20.0  # for so long nobody walks or drives into anything
-ROBOT_RADIUS_M = 0.35    # m: radius of a robot that drives on no road
+DRIVE_SECONDS = 20.0  # during which nothing collides
+ROBOT_RADIUS_M = 0.35  # of a robot off the road
 
 
 class TrajectoryPoint(NamedTuple):
-    """Where a way is at a time: x, y (world, m), heading (rad), velocity (2,) in the world (m/s)
-    and yaw_rate (rad/s, counter-clockwise)."""
+    """A trajectory at one time: x, y in the world (m), heading (rad), velocity (2,) in the world
+    (m/s) and yaw_rate (rad/s, counter-clockwise)."""
 
     x: float
     y: float
@@ -23,14 +23,16 @@ class TrajectoryPoint(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """x = speed * t, y = the sum of reach * sin(rate * t + phase) over the sways: m, rad/s, rad; so
-    that heading, velocity and yaw rate are its exact derivatives. Without sways it is straight."""
+    """x = speed * t and y = sum of reach * sin(rate * t + phase) over the sways (m, rad/s, rad).
+
+    Heading, velocity and yaw rate are exact derivatives. Without sways it is straight.
+    """
 
     speed: float = 0.0
     sways: tuple[tuple[float, float, float], ...] = ()
 
     def at(self, t: float) -> TrajectoryPoint:
-        """Where it is after t seconds."""
+        """Return the point after t seconds."""
         y = aside = turning = 0.0
         for reach, rate, phase in self.sways:
             sin, cos = math.sin(rate * t + phase), math.cos(rate * t + phase)
@@ -42,15 +44,21 @@ class Trajectory(NamedTuple):
                                (self.speed, aside), yaw_rate)
 
     def sampled(self, seconds: float, step: float) -> np.ndarray:
-        """(T, 3) float64 rows [t x y] every step seconds from 0 to seconds, both included."""
+        """Return (T, 3) float64 rows [t x y] from 0 to seconds, every step seconds."""
         times = np.linspace(0.0, seconds, round(seconds / step) + 1)
         return np.array([(t, *self.at(t)[:2]) for t in times])
 
 
 def draw_trajectory(rng: np.random.Generator, speed: tuple[float, float], stands: float,
                     turn: float) -> Trajectory:
-    """A way at a speed drawn from that range, m/s, that stands with that probability, else turns up
-    to so far to both sides, rad, in 8 to 25 s."""
+    """Draw a trajectory that stands still or sways in 8 to 25 s.
+
+    Args:
+        rng: Random generator.
+        speed: Range of the speed, m/s.
+        stands: Probability of standing still.
+        turn: Largest heading to both sides, rad.
+    """
     if rng.random() < stands:
         return Trajectory()
     pace, long = rng.uniform(*speed), 2 * np.pi / rng.uniform((8.0, 15.0), (15.0, 25.0))

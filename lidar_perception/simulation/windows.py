@@ -1,4 +1,4 @@
-"""Which rays can meet a solid: a window of the grid of firings and beams."""
+"""Windows of the grid of firings and beams that contain all rays that can hit a solid."""
 
 from __future__ import annotations
 
@@ -13,9 +13,14 @@ from lidar_perception.simulation.solids import BOX, ELLIPSOID, Solids
 
 
 class Windows(NamedTuple):
-    """Of P solids: first (P,) int64 column, 0 .. columns - 1, and how many from there count (P,)
-    int64, counted past the end; beams (P, rings) bool. No ray outside meets the solid, and none
-    nearer than near (P,) m."""
+    """Windows of P solids; no ray outside hits the solid.
+
+    Attributes:
+        first: (P,) int64 first column, 0 .. columns - 1.
+        count: (P,) int64 number of columns, which may continue past the last one at 0.
+        beams: (P, rings) bool.
+        near: (P,) m; no hit is nearer.
+    """
 
     first: np.ndarray
     count: np.ndarray  # type: ignore[assignment]  # a tuple has a count of its own
@@ -24,9 +29,12 @@ class Windows(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """What the windows of all solids need of the sensor and its motion. rise and fall (rings,): the
-    steepest and the least steep of a beam's rays; lift (rings,) m; wide: margin in azimuth;
-    begin and end of the turn, seconds after the stamp; moves: whether anything does."""
+    """Properties of the sensor and its motion that the windows of all solids need.
+
+    rise and fall: (rings,) slopes of a beam's highest and lowest rays; lift: (rings,) m; wide:
+    margin in azimuth, rad; begin and end of the turn: seconds after the stamp; moves: anything
+    moves.
+    """
 
     columns: int
     rate: float
@@ -44,8 +52,14 @@ class Grid(NamedTuple):
 
 def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION,
                  margin: float = 0.0) -> Windows:
-    """The windows of solids in the frame at the stamp; margin, radians: of rays that differ so
-    much from the sensor's. Beams that start over each other are taken as they are."""
+    """Find the windows of solids in the sensor's frame at the stamp.
+
+    Args:
+        solids: The solids.
+        sensor: The sensor; its beams may start at different heights.
+        motion: Motion of the sensor.
+        margin: Largest deviation of rays from the sensor's, rad.
+    """
     relative = solids.velocity - np.asarray(motion.velocity, np.float64)
     since = sensor.times() - motion.stamp / sensor.rate
     elevations, limit = np.asarray(sensor.elevations), np.pi / 2 - 1e-6
@@ -69,8 +83,7 @@ def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION,
 def _fill_windows(found, grid, kind, centre, half, axes, relative):
     corners, facing, reach = np.empty((16, 3)), np.empty((3, 3)), np.empty(3)
     for p in range(len(kind)):
-        # From the time of the whole turn a window; from it the time for which the sensor looks
-        # there.
+        # The time of the whole turn gives a window, which gives the time when the sensor faces it.
         begin, end = (grid.begin, grid.end) if grid.moves else (0.0, 0.0)
         for _ in range(3 if grid.moves else 1):
             ahead = _find_direction(centre[p], relative[p], (begin + end) / 2)
@@ -90,7 +103,7 @@ def _fill_windows(found, grid, kind, centre, half, axes, relative):
 
 @njit(cache=True, nogil=True)
 def _find_direction(centre, relative, since):
-    """The level direction to a solid."""
+    """Return the horizontal direction to a solid."""
     x, y = centre[0] + relative[0] * since, centre[1] + relative[1] * since
     far = max(math.hypot(x, y), 1e-9)
     return x / far, y / far
@@ -98,8 +111,10 @@ def _find_direction(centre, relative, since):
 
 @njit(cache=True, nogil=True)
 def _fill_corners(corners, facing, reach, kind, centre, half, axes, relative, ahead, begin, end):
-    """Fills corners (16, 3) around a solid from begin to end, s, and the axes of the box that they
-    are: its own of a box; around what is round one that faces the sensor is tighter."""
+    """Fill the corners (16, 3) of a box around a solid from begin to end (s), and its axes.
+
+    Round solids get a box that faces the sensor, which is tighter.
+    """
     if kind == BOX:
         facing[:] = axes
         reach[:] = half
@@ -126,7 +141,7 @@ def _fill_corners(corners, facing, reach, kind, centre, half, axes, relative, ah
 
 @njit(cache=True, nogil=True)
 def _find_columns(corners, grid, begin, end):
-    """First column and how many, of a sensor that turns meanwhile."""
+    """Return the first column and the number of columns; the sensor turns meanwhile."""
     x, y = 0.0, 0.0
     for n in range(16):
         x, y = x + corners[n, 0], y + corners[n, 1]
@@ -135,7 +150,7 @@ def _find_columns(corners, grid, begin, end):
         bearing = math.atan2(corners[n, 1], corners[n, 0]) - middle
         bearing = (bearing + np.pi) % (2 * np.pi) - np.pi
         low, high = min(low, bearing), max(high, bearing)
-    around = high - low >= np.pi  # the sensor is within the hull's shadow
+    around = high - low >= np.pi  # the sensor is above or below the box
     turned = grid.yaw_rate * begin, grid.yaw_rate * end
     low, high = low - max(turned) - grid.wide, high - min(turned) + grid.wide
     step = 2 * np.pi / grid.columns
@@ -148,10 +163,10 @@ def _find_columns(corners, grid, begin, end):
 
 @njit(cache=True, nogil=True)
 def _fill_beams(corners, facing, ahead, grid, beams):
-    """Fills which beams (rings,) reach the height of the hull; how near that comes to the z
-    axis."""
+    """Fill which beams (rings,) reach the height of the box; return its distance from the z axis.
+    """
     near, far, bottom, top = 0.0, 0.0, np.inf, -np.inf
-    for side in range(3):  # level directions: of two sides of the hull and of its bearing
+    for side in range(3):  # horizontal directions: two sides of the box, and towards it
         x, y = ahead if side == 2 else (facing[0, side], facing[1, side])
         long = max(math.hypot(x, y), 1e-9)
         least, most = np.inf, -np.inf

@@ -121,7 +121,7 @@ def fit_fusion(weights: Path | None, classifier: Path | None, out: Path, params:
     params = fill_from_header(params, header)
     sensor = find_sensor(params.sensor, params.mount_height or _find_trained_height(header))
     scenes = Scenes(None, params.people, params.scene)
-    scenes.sorts()  # raises InputError for an unknown one
+    scenes.scene_types()  # raises InputError for an unknown one
     around = detector.range == "around"
     errors.print(f"{params.scans} {params.scene} scans of {params.sensor} at {sensor.height:g} m, "
                  f"{'all around' if around else 'ahead'}")

@@ -64,7 +64,7 @@ def open_sources(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
     simulate = partial(SimulatedScenes, sensor=sensor, cache_gb=params.cache_gb,
                        cache=Path(params.cache) if params.cache else None)
     if SIM in (*data, *val):
-        Scenes(None, params.people, scene).sorts()  # raises InputError before anything is made
+        Scenes(None, params.people, scene).scene_types()  # raises InputError before any work
     if SIM in data:
         sources.append(simulate(FIRST_SCENE, params.scans,
                                 scenes=Scenes(None, params.people, scene),

@@ -1,4 +1,4 @@
-"""Laws of the ray caster."""
+"""The ray caster."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ DRIVE = Motion((12.0, -1.0, 0.2), 0.8, stamp=0.3)
 
 
 def reference(made, sensor, motion=NO_MOTION):
-    """Range, solid (columns, rings) and reached, one solid after the other against every ray."""
+    """Return range, solid (columns, rings) and reached by testing every solid with every ray."""
     turn = make_rays(sensor, motion)
     nearest = np.full(turn.direction.shape[:2], np.inf)
     solid, reached = np.full(nearest.shape, -1), {}
@@ -58,7 +58,7 @@ def same(one, other):
 
 @pytest.mark.parametrize("motion", [NO_MOTION, DRIVE])
 @pytest.mark.parametrize("seed", range(4))
-def test_all_kinds_are_met_as_by_a_slow_reference(seed, motion):
+def test_hits_equal_slow_reference(seed, motion):
     made = crowd(seed)
     for sensor in (SENSOR, replace(SENSOR, lifts=(), elevations=tuple(np.linspace(1.4, -1.4, 9)))):
         hits = cast_rays(made, Ground(), NO_GROUND, sensor, motion)
@@ -77,7 +77,7 @@ def leafy(seed):
                    transmission=np.where(rng.random(60) < 0.3, 0.5, 0.0))
 
 
-def test_the_same_arguments_give_the_same_bytes_and_another_seed_others():
+def test_hits_depend_on_seed_only():
     for seed, motion in ((0, NO_MOTION), (1, DRIVE)):
         scene = leafy(seed), FULL._replace(rough=0.05), OVER_ROAD, WIDE, motion
         one = cast_rays(*scene, seed)
@@ -87,9 +87,9 @@ def test_the_same_arguments_give_the_same_bytes_and_another_seed_others():
 
 
 @pytest.mark.parametrize("motion", [NO_MOTION, DRIVE])
-def test_what_is_cast_together_is_the_nearest_of_what_is_cast_alone(motion):
-    """Neither the order in which solids are drawn nor what is skipped as hidden changes a byte:
-    a heap of solids, most of them without an owner, that overlap and lie in high grass."""
+def test_nearest_of_single_casts_equals_joint_cast(motion):
+    """Overlapping solids in high grass, most without an owner: neither order nor skipping changes a
+    byte."""
     count, rng = 160, np.random.default_rng(0)
     made = crowd(5, count)
     far = np.linalg.norm(made.centre[:, :2], axis=1)[:, None]
@@ -121,7 +121,7 @@ def test_order_of_solids_does_not_matter():
     assert np.array_equal(one.range, other.range) and np.array_equal(one.reached, other.reached)
 
 
-def test_turned_things_give_turned_hits():
+def test_turned_solids_give_turned_hits():
     made, shift = crowd(3, moving=False), 77
     angle = 2 * np.pi * shift / SENSOR.columns
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0],
@@ -132,7 +132,7 @@ def test_turned_things_give_turned_hits():
     assert np.allclose(np.roll(one.range, shift, axis=0), other.range, rtol=1e-9)
 
 
-def test_a_moving_solid_is_seen_where_it_is_when_the_ray_leaves():
+def test_moving_solid_is_hit_at_firing_time():
     velocity = np.array([10.0, -15.0, 0.0])
     made = solids(BOX, (-9, 3, 0), (1, 2, 1), velocity=velocity)
     hits, since = cast_rays(made, Ground(), NO_GROUND, SENSOR), make_rays(SENSOR).since
@@ -145,7 +145,7 @@ def test_a_moving_solid_is_seen_where_it_is_when_the_ray_leaves():
                            cast_rays(there, Ground(), NO_GROUND, SENSOR).range[column])
 
 
-def test_a_wall_is_flat_only_after_compensation():
+def test_wall_is_flat_only_after_compensation():
     wall = solids(BOX, (10, 0, 0), (1, 40, 8))
     exact = replace(SENSOR, range_noise=0.0, dropout=0.0)
     hits = cast_rays(wall, Ground(), NO_GROUND, exact, DRIVE)
@@ -160,12 +160,12 @@ def test_a_wall_is_flat_only_after_compensation():
 
 @pytest.fixture
 def even_leaves(monkeypatch):
-    """Leaves everywhere, not in clumps."""
+    """Fill all cells with leaves."""
     monkeypatch.setattr(foliage, "LEAF_SHARE", 1.0)
 
 
-def test_leaves_hang_in_clumps_that_do_not_change_along_a_drive():
-    """Two casts with other random numbers meet leaves in the same cells only; a share of FILLED."""
+def test_leaf_clumps_are_constant_during_drive():
+    """Two casts with other random numbers hit leaves in the same cells, a share of LEAF_SHARE."""
     fine = make_generic_sensor(64, -8.0, 8.0, 0.1, 10.0, divergence=0.0)
     plant = solids(BOX, (12, 0, 0), (3, 3, 3), density=2.0)
     filled = []
@@ -183,7 +183,7 @@ def test_leaves_hang_in_clumps_that_do_not_change_along_a_drive():
 
 
 @pytest.mark.parametrize("kind", [BOX, ELLIPSOID, CYLINDER])
-def test_foliage_stops_rays_after_its_mean_free_path(kind, even_leaves):
+def test_foliage_stops_rays_after_mean_free_path(kind, even_leaves):
     fine = make_generic_sensor(32, -8.0, 8.0, 0.2, 10.0, divergence=0.0)
     thin, thick = (cast_rays(solids(kind, (12, 0, 0), (3, 3, 3), density=density), Ground(),
                              NO_GROUND, fine, seed=5) for density in (np.inf, 0.7))
@@ -198,14 +198,14 @@ def test_foliage_stops_rays_after_its_mean_free_path(kind, even_leaves):
     assert thick.reached[1] == np.isfinite(thick.range).sum() < thin.reached[1]
 
 
-def test_from_within_foliage_stops_rays_and_what_is_opaque_does_not(even_leaves):
+def test_rays_from_inside_are_stopped_only_by_foliage(even_leaves):
     inside = [cast_rays(solids(ELLIPSOID, (0.5, 0, 0), (4, 4, 4), density=density), Ground(),
                         NO_GROUND, SENSOR).range for density in (np.inf, 1.0)]
     assert not np.isfinite(inside[0]).any()
     assert abs((inside[1] < 1).mean() - (1 - np.exp(-1))) < 0.03 and inside[1].min() > 0
 
 
-def test_glass_lets_its_share_pass_to_what_is_behind():
+def test_glass_passes_its_share_of_rays():
     panes = solids([BOX, BOX], [(8, 0, 0), (12, 0, 0)], (0.01, 3, 2), [1, 2],
                    transmission=0.7)
     panes = replace(panes, transmission=np.array([0.7, 0.0]))
@@ -218,7 +218,7 @@ def test_glass_lets_its_share_pass_to_what_is_behind():
     assert set(np.unique(hits.owner[front])) == {1, 2}
 
 
-def test_nearest_wins_and_occlusion_is_seen():
+def test_nearest_solid_wins_and_reached_counts_hidden_rays():
     both = solids([BOX, BOX], [(9, 0, 0), (5, 0, 0)], (0.5, 0.5, 1.0), [2, 1])
     hits = cast_rays(both, Ground(), OVER_ROAD, SENSOR)
     seen = np.bincount(hits.owner.ravel(), minlength=3)
@@ -226,7 +226,7 @@ def test_nearest_wins_and_occlusion_is_seen():
     assert seen[1] == hits.reached[1] and seen[2] < 0.4 * hits.reached[2]
 
 
-def test_beams_at_edges_return_from_between_or_from_one_side():
+def test_edge_beams_return_from_between_or_one_side():
     near, far = (BOX, (5, 0, 0), (0.2, 1, 1)), (BOX, (5.7, 0, 0), (0.2, 9, 4))
     made = solids(*zip(near, far), [1, 2])
     fine = make_generic_sensor(64, -10.0, 10.0, 0.2, 10.0, divergence=3e-3)
@@ -246,14 +246,14 @@ def test_beams_at_edges_return_from_between_or_from_one_side():
     assert np.array_equal(beams.reached, exact.reached)
 
 
-def test_a_beam_within_one_surface_is_a_ray():
+def test_beam_on_one_surface_equals_ray():
     made = solids(BOX, (8, 0, 0), (1, 200, 200))
     one, other = (cast_rays(made, Ground(), NO_GROUND, s) for s in (SENSOR, WIDE))
     inner = np.isfinite(np.roll(one.range, 1, 0)) & np.isfinite(np.roll(one.range, -1, 0))
     assert np.array_equal(one.range[inner], other.range[inner])
 
 
-def test_random_numbers_are_uniform_and_keep_their_place():
+def test_hashed_numbers_are_uniform_and_reproducible():
     def numbers(seed, count=40_000):
         return np.array([hash_uniform(seed, np.uint64((7 << 32) + i)) for i in range(count)])
 

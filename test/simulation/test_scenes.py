@@ -1,4 +1,4 @@
-"""Laws of the scenes for robots, and of streets beside them."""
+"""Scenes for robots, compared with streets."""
 
 from dataclasses import replace
 from functools import cache
@@ -44,16 +44,16 @@ def moved(xyz, pose):
 @pytest.mark.parametrize("scenes, seed, moment, points, metres, labels", [
     (Scenes(), 1, 0, 2575, 40385.126304, 129.929893373),
     (Scenes("zone", 3.0), 5, 60, 2543, 46185.171547, 659.233862469)])
-def test_a_seed_gives_the_street_that_it_always_gave(scenes, seed, moment, points, metres, labels):
-    """Written down anew where simulated cars, say, are made otherwise on purpose."""
+def test_seed_gives_known_scene(scenes, seed, moment, points, metres, labels):
+    """Update the values when things are changed on purpose."""
     scan = simulate_scan(seed, moment, TINY, scenes)
     assert len(scan.frame) == points
     assert np.abs(scan.frame.xyz, dtype=float).sum() == pytest.approx(metres, rel=1e-6)
     assert np.abs(scan.truth.boxes).sum() == pytest.approx(labels, rel=1e-9)
 
 
-def test_a_way_is_smooth():
-    """Its heading, velocity and yaw rate are the derivatives of where it is."""
+def test_trajectory_derivatives_are_exact():
+    """Heading, velocity and yaw rate are derivatives of the position."""
     h = 1e-4
     for seed in range(20):
         way = draw_trajectory(np.random.default_rng(seed), (0.5, 1.5), 0.2, 0.7)
@@ -70,7 +70,7 @@ def test_a_way_is_smooth():
 
 
 @pytest.mark.parametrize("scene, kind", ROBOTS)
-def test_nobody_runs_into_the_robot_or_each_other(scene, kind):
+def test_actors_never_touch_robot_or_each_other(scene, kind):
     made = scene_of(scene, kind)
     props = [a for a in made.actors if not a.thing.label]
     fixed = flat_boxes(np.array([a.footprint for a in props]), 0.0)
@@ -87,9 +87,9 @@ def test_nobody_runs_into_the_robot_or_each_other(scene, kind):
 
 
 @pytest.mark.parametrize("scene, kind", ROBOTS)
-def test_points_and_boxes_are_where_they_are_in_the_world(scene, kind):
-    """Whatever the robot's heading and turning: the ground is that of the world, and points of who
-    has a label lie in that label."""
+def test_points_and_boxes_agree_with_world(scene, kind):
+    """At any heading and yaw rate the ground agrees with the world, and points of labelled objects
+    are in their boxes."""
     made = scene_of(scene, kind)
     made = replace(made, ground=made.ground._replace(rough=0.0, litter=0.0))
     for t in (0.0, 7.3):
@@ -113,9 +113,9 @@ def test_points_and_boxes_are_where_they_are_in_the_world(scene, kind):
             assert far.max() < np.hypot(*box[3:5]) / 2 + 0.6 + speed / TINY.rate
 
 
-def test_a_turned_sensor_sees_the_same():
-    """Two robots at one place, one turned by twenty firings: its rays meet what those of the other
-    meet that look there, but for what glass lets through."""
+def test_turned_sensor_has_same_hits():
+    """Of two robots in one place, one is turned by twenty firings. Rays in the same direction have
+    the same hits, except through glass."""
     made, ranges, turn = scene_of("indoor", "store"), [], 20 * 2 * np.pi / EXACT.columns
     for aside in (0.0, np.tan(turn)):
         one = replace(made, way=Trajectory(1e-9, ((1e-9 * aside, 1.0, 0.0),)))
@@ -138,7 +138,7 @@ def test_robots_have_labels_all_around_and_no_camera(tmp_path):
     assert next(simulate_frames(3, 1, TINY, 1)).camera() is not None
 
 
-def test_a_mix_takes_turns_and_is_trained_on():
+def test_mixed_scenes_alternate():
     mixed = Scenes(None, 1.0, "street,indoor")
     assert scene_of("indoor", None, 3).kind == make_scene(3, None, 2.0, mixed.scene).kind
     assert make_scene(4, None, 1.0, mixed.scene).kind == make_scene(4).kind
@@ -160,7 +160,7 @@ def test_setup_finds_the_height_indoors(kind):
 
 
 @pytest.mark.parametrize("layout", ["mcap", "kitti-tracking", "semantickitti"])
-def test_the_command_writes_every_layout_of_a_robot(layout, tmp_path):
+def test_command_writes_every_layout_for_robots(layout, tmp_path):
     out = tmp_path / "drive"
     result = CliRunner().invoke(simulate, [
         "--scene", "campus", "--kind", "path", "--sensor", "generic:16,-15,15,2,10",
@@ -184,12 +184,12 @@ def test_the_command_writes_every_layout_of_a_robot(layout, tmp_path):
     (Scenes("city", 1.0, "street,campus"), "kind = 'city' must be one of forecourt, square, path"),
     (Scenes(people=np.nan), "people = nan must be 0 .. 100"),
     (Scenes(people=1e25), "people = 1e.25 must be 0 .. 100")])
-def test_what_is_no_scene_is_named(scenes, said):
+def test_unknown_scenes_are_named(scenes, said):
     with pytest.raises(InputError, match=said):
         next(simulate_frames(0, 1, TINY, 1, scenes))
 
 
-def test_beams_that_wander_do_so_where_there_is_one_scan_of_each_scene():
+def test_wandering_beams_differ_between_scenes():
     sensor, seen = replace(EXACT, wander=np.radians(2.0)), []
     for seed in range(3):
         scan = simulate_scan(seed, 0, sensor, Scenes(scene="campus"))

@@ -1,4 +1,4 @@
-"""Laws of sensors and of what they report."""
+"""Sensors and their returns."""
 
 import warnings
 from dataclasses import replace
@@ -28,7 +28,7 @@ SMALL = make_generic_sensor(8, -10.0, 4.0, 0.5, 10.0)
 
 
 def hits(sensor, distance, brightness=0.3, cosine=1.0):
-    """Every ray meets something at this distance, of this brightness; arrays or numbers."""
+    """Return hits of every ray at a distance and brightness; arrays or numbers."""
     shape = sensor.columns, sensor.rings
     return Hits(np.broadcast_to(np.asarray(distance, float), shape),
                 np.broadcast_to(np.asarray(brightness, float), shape),
@@ -56,7 +56,7 @@ def test_presets_are_sensible(name):
     assert len(np.unique(times)) == sensor.columns
 
 
-def test_kittis_sensor_is_kittis():
+def test_hdl64e_agrees_with_kitti():
     assert (HDL64E.height, HDL64E.columns, HDL64E.rate) == (1.73, 2140, 10.0)
     step = {rate: np.degrees(make_hdl64e(rate).azimuth_step) for rate in (5, 10, 20)}
     assert step[5] < 0.085 and abs(step[10] - 0.168) < 1e-3 and abs(step[20] / step[10] - 2) < 1e-3
@@ -91,12 +91,12 @@ def test_impossible_generic_sensors_and_unknown_names_are_refused():
         find_sensor("hdl128")
 
 
-def test_names_are_known_however_they_are_written():
+def test_names_are_found_in_any_spelling():
     assert find_sensor("os1_64") == find_sensor("OS1-64") != find_sensor("os1-128")
     assert find_sensor("hdl64e") == find_sensor("HDL-64E") == HDL64E
 
 
-def test_a_file_in_degrees_is_the_sensor_in_radians(tmp_path):
+def test_file_in_degrees_gives_sensor_in_radians(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("name: mine\nelevations: [4, 0, -10.5]\nazimuth_step: 0.5\nrate: 10\n"
                     "divergence: 0.2\nfade: [10, 0.1]\nblocked:\n- [1, 350, 10]\nwander: 2\n")
@@ -107,7 +107,7 @@ def test_a_file_in_degrees_is_the_sensor_in_radians(tmp_path):
 
 
 @pytest.mark.parametrize("text, named", [
-    ("[1, 2", "no YAML"), ("rate: 2024-13-45", "no YAML"), ("rate: " + "1" * 5000, "no YAML"),
+    ("[1, 2", "not YAML"), ("rate: 2024-13-45", "not YAML"), ("rate: " + "1" * 5000, "not YAML"),
     ("- 1", "describes no sensor"), ("azimuth_step: 1", "elevations"),
     ("elevations: [1]\nazimuth_step: 1\nrate: 10\nbeams: 3", "no 'beams'; known are"),
     ("elevations: 3\nazimuth_step: 1\nrate: 10", "elevations = 3 must be a list of numbers"),
@@ -123,7 +123,7 @@ def test_a_file_in_degrees_is_the_sensor_in_radians(tmp_path):
     ("elevations: [1]\nazimuth_step: 1\nrate: 10\nfade: []", "fade"),
     ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [[.inf, 0, 10]]", "blocked"),
     ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [[0.5, 0, 10]]", "blocked")])
-def test_a_file_of_no_possible_sensor_is_named_with_what_is_wrong(tmp_path, text, named):
+def test_bad_sensor_file_is_named_with_reason(tmp_path, text, named):
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=named) as error:
@@ -131,7 +131,7 @@ def test_a_file_of_no_possible_sensor_is_named_with_what_is_wrong(tmp_path, text
     assert str(path) in str(error.value) and "\n" not in str(error.value)
 
 
-def test_beams_that_wander_fill_the_gaps_between_them_evenly():
+def test_wandering_beams_fill_gaps_evenly():
     sensor = replace(SMALL, wander=np.radians(2.0))
     turns = [sensor.at_turn(i) for i in range(50)]
     lower = np.sort([sensor.elevations[3] - turn.elevations[3] for turn in turns])
@@ -158,7 +158,7 @@ def test_same_seed_same_bytes():
     assert one.xyz.tobytes() != other.xyz.tobytes()
 
 
-def test_returns_are_as_promised():
+def test_returns_have_documented_properties():
     sensor = replace(HDL64E, azimuth_step=np.radians(1.0))
     rng = np.random.default_rng(0)
     shape = sensor.columns, sensor.rings
@@ -178,7 +178,7 @@ def test_returns_are_as_promised():
     assert (np.diff(bearing)[np.diff(found.ring) == 0] > -1e-5).all()
 
 
-def test_a_ring_keeps_its_elevation_and_time_its_bearing():
+def test_ring_gives_elevation_and_time_gives_azimuth():
     found = measured(SMALL, 30.0)
     rise = found.xyz[:, 2] / np.linalg.norm(found.xyz, axis=1)
     assert np.allclose(np.arcsin(rise), np.array(SMALL.elevations)[found.ring], atol=1e-5)
@@ -186,12 +186,12 @@ def test_a_ring_keeps_its_elevation_and_time_its_bearing():
     assert np.allclose(found.time, make_rays(SMALL).since[column.astype(int) % SMALL.columns])
 
 
-def test_noise_is_as_wide_as_told():
+def test_range_noise_has_given_deviation():
     found = measured(replace(SMALL, range_noise=0.05), 20.0)
     assert abs((np.linalg.norm(found.xyz, axis=1) - 20).std() - 0.05) < 0.003
 
 
-def test_beams_may_disagree_about_the_range():
+def test_offsets_shift_ranges_per_beam():
     offsets = tuple(np.linspace(-0.05, 0.05, 8))
     found = measured(replace(SMALL, offsets=offsets), 20.0)
     for ring, offset in enumerate(offsets):
@@ -200,7 +200,7 @@ def test_beams_may_disagree_about_the_range():
     assert 0.01 < np.std(HDL64E.offsets[:39]) < 0.03
 
 
-def test_far_and_dark_is_lost():
+def test_far_and_dark_returns_are_lost():
     open_sensor = replace(SMALL, dropout=0.0)
     share = {(r, b): len(measured(open_sensor, r, b).xyz) / SMALL.columns / SMALL.rings
              for r in (5, 25, 50, 100) for b in (0.03, 0.1, 0.4, 0.9)}
@@ -216,7 +216,7 @@ def test_far_and_dark_is_lost():
     assert abs(lost - 0.2) < 0.03
 
 
-def test_an_endless_reach_loses_what_meets_nothing_and_nothing_else():
+def test_infinite_reach_loses_only_rays_without_hit():
     sensor = replace(SMALL, reach=np.inf, dropout=0.0)
     distance = np.where(np.arange(sensor.columns) % 2, np.inf, 100.0)[:, None]
     with warnings.catch_warnings():
@@ -225,7 +225,7 @@ def test_an_endless_reach_loses_what_meets_nothing_and_nothing_else():
     assert len(found.xyz) == sensor.columns * sensor.rings / 2
 
 
-def test_intensity_is_the_brightness_unless_the_beam_or_range_says_otherwise():
+def test_intensity_is_brightness_with_bias_and_fade():
     plain = measured(SMALL, 10.0, 0.4)
     assert abs(plain.intensity.mean() - 0.4) < 0.005
     faded = measured(replace(SMALL, fade=(18.0, 0.01)), 28.0, 0.4)
@@ -236,7 +236,7 @@ def test_intensity_is_the_brightness_unless_the_beam_or_range_says_otherwise():
         assert abs(biased.intensity[biased.ring == ring].mean() - 0.4 - bias) < 0.01
 
 
-def test_what_is_weak_reads_0_and_nothing_else_does():
+def test_only_weak_returns_have_intensity_0():
     sensor = replace(SMALL, floor=0.2, biases=(0.1,) * 8)
     assert (measured(sensor, 10.0, 0.05).intensity == 0).all()
     assert (measured(sensor, 10.0, 0.4).intensity > 0.2).all()
@@ -253,7 +253,7 @@ def test_retroreflectors_do_not_fade():
     assert RETROREFLECTOR > 1.2 * compute_brightness(0.99, 0.1)
 
 
-def test_the_vehicle_blocks_its_sectors():
+def test_vehicle_blocks_its_sectors():
     sensor = replace(SMALL, blocked=((4, 350, 10), (6, 90, 120)), dropout=0.0)
     found = measured(sensor, 10.0)
     bearing = np.degrees(np.arctan2(found.xyz[:, 1], found.xyz[:, 0]))
@@ -266,12 +266,12 @@ def test_the_vehicle_blocks_its_sectors():
 
 @pytest.mark.parametrize("start, end, degrees", [
     (0, 360, 360), (-180, 180, 360), (-10, 370, 360), (350, 10, 20), (-10, 10, 20), (10, 10, 0)])
-def test_a_sector_is_as_wide_as_told_and_may_be_the_whole_turn(start, end, degrees):
+def test_blocked_sector_may_be_whole_turn(start, end, degrees):
     shut = ~replace(SMALL, blocked=((4, start, end),)).open_rays()
     assert (shut[:, 4:].sum(axis=0) == 2 * degrees).all() and not shut[:, :4].any()
 
 
-def test_a_generic_sensor_can_be_named():
+def test_generic_sensor_is_found_by_name():
     expected = make_generic_sensor(32, -25.0, 15.0, 0.2, 10.0)
     assert find_sensor("generic:32,-25,15,0.2,10") == expected
 
@@ -283,7 +283,7 @@ def test_a_generic_sensor_can_be_named():
                                   "generic:a,b,c,d,e",
                                   "generic:32,-25,15,0.2,10,3", "generic:32,15,-25,0.2,10",
                                   "generic:0,-25,15,0.2,10", "generic:nan,-25,15,0.2,10"])
-def test_a_generic_sensor_that_cannot_be_is_refused_in_one_line(name):
+def test_bad_generic_sensor_is_refused_in_one_line(name):
     with pytest.raises(InputError) as error:
         find_sensor(name)
     assert "\n" not in str(error.value) and "must" in str(error.value)

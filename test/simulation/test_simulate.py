@@ -1,5 +1,5 @@
-"""Laws of the command that makes data sets: neither a stop nor the number of processes changes a
-byte, and what is there is not touched."""
+"""The command simulate: interruptions and the number of processes change no byte, and existing
+files are not touched."""
 
 import contextlib
 import errno
@@ -42,7 +42,7 @@ def invoke(options):
     return result
 
 
-def test_a_data_set_says_how_it_was_made(made):
+def test_data_set_records_its_settings(made):
     record = json.loads((made / "semantickitti/dataset.json").read_text())
     assert record.items() >= {"format": "semantickitti", "sensor": "tiny", "seed": 3, "frames": 5,
                               "streets_of": 2}.items()
@@ -50,7 +50,7 @@ def test_a_data_set_says_how_it_was_made(made):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_data_set_that_failed_in_the_middle_is_marked_and_resumed(made, tmp_path, monkeypatch,
+def test_failed_data_set_is_marked_and_resumed(made, tmp_path, monkeypatch,
                                                                      layout):
     out, calls = tmp_path / "set", itertools.count()
 
@@ -74,8 +74,10 @@ def test_a_data_set_that_failed_in_the_middle_is_marked_and_resumed(made, tmp_pa
 
 @pytest.fixture
 def start():
-    """start(out, frames, ...): the command in a process group of its own, once it has finished a
-    few frames. Whatever happens, none of the group outlives the test."""
+    """start(out, frames, ...) runs the command in its own process group until some frames are done.
+
+    The group ends with the test.
+    """
     groups = []
 
     def begun(out, frames, *more):
@@ -98,7 +100,7 @@ def start():
             os.killpg(group, signal.SIGKILL)
 
 
-def test_after_a_kill_nothing_runs_on_and_it_goes_on_where_it_was(start, tmp_path):
+def test_killed_command_leaves_no_process_and_resumes(start, tmp_path):
     out, frames = tmp_path / "set", 40
     process = start(out, frames, "--streets-of", 30)  # in two processes; the rest in one
     os.kill(process.pid, signal.SIGKILL)  # its children end by themselves
@@ -116,7 +118,7 @@ def test_after_a_kill_nothing_runs_on_and_it_goes_on_where_it_was(start, tmp_pat
     assert len(list(out.glob("training/label_02/*.txt"))) == 2
 
 
-def test_two_writers_do_not_meet_and_ctrl_c_ends_all_processes(start, tmp_path):
+def test_data_set_is_locked_and_ctrl_c_ends_processes(start, tmp_path):
     process = start(tmp_path / "set", 100_000)
     for more in (["--resume"], ["--force"], []):
         with pytest.raises(InputError, match="another process"):
@@ -130,7 +132,7 @@ def test_two_writers_do_not_meet_and_ctrl_c_ends_all_processes(start, tmp_path):
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_a_full_disk_is_one_line_and_bad_input(made, tmp_path, monkeypatch, call):
+def test_full_disk_is_one_line_error(made, tmp_path, monkeypatch, call):
     out, calls, real = tmp_path / "set", itertools.count(), getattr(os, call)
 
     def full(*args, **others):
@@ -148,7 +150,7 @@ def test_a_full_disk_is_one_line_and_bad_input(made, tmp_path, monkeypatch, call
     assert content(out) == content(made / "kitti")
 
 
-def test_what_cannot_be_written_ends_the_work(tmp_path):
+def test_unwritable_file_ends_work(tmp_path):
     blocked = tmp_path / "set/training/velodyne/000003.bin"
     run(tmp_path / "set", "kitti", 5, 1, "--streets-of", 5)
     (tmp_path / "set/dataset.json").rename(tmp_path / "set/INCOMPLETE")  # .parts is gone already
@@ -159,7 +161,7 @@ def test_what_cannot_be_written_ends_the_work(tmp_path):
     assert (tmp_path / "set/INCOMPLETE").exists()
 
 
-def test_what_is_there_is_not_touched_without_a_word(made, tmp_path):
+def test_existing_files_are_not_touched_without_option(made, tmp_path):
     out = tmp_path / "set"
     assert run(out, "kitti", 2).exit_code == 0
     before = content(out)
@@ -190,7 +192,7 @@ def test_what_is_there_is_not_touched_without_a_word(made, tmp_path):
     assert content(out) == content(made / "semantickitti")
 
 
-def test_the_recorded_command_makes_the_same_again(tmp_path):
+def test_recorded_command_reproduces_data_set(tmp_path):
     sensor = tmp_path / "my sensor.yaml"
     sensor.write_text("elevations: [2, -8]\nazimuth_step: 5\nrate: 10\nheight: 12.3456789\n")
     made, again = tmp_path / "made", tmp_path / "again"
@@ -203,7 +205,7 @@ def test_the_recorded_command_makes_the_same_again(tmp_path):
     assert content(again) == content(made)
 
 
-def test_a_set_is_not_resumed_with_another_sensor_of_the_same_name(tmp_path):
+def test_other_sensor_of_same_name_is_not_resumed(tmp_path):
     sensor, out = tmp_path / "mine.yaml", tmp_path / "set"
     sensor.write_text("elevations: [2, -8]\nazimuth_step: 5\nrate: 10\n")
     options = ["--out", str(out), "--format", "kitti", "--sensor", str(sensor), "--frames", "1",

@@ -1,5 +1,4 @@
-"""Laws of simulated data sets: scans have what they promise, and are read back from every
-layout."""
+"""Simulated data sets: documented properties of scans, and reading from every layout."""
 
 import itertools
 
@@ -24,7 +23,7 @@ pytestmark = [pytest.mark.no_cover,  # others run these lines
               pytest.mark.usefixtures("streets", "tiny_sensor")]
 
 
-def test_any_scan_of_a_drive_can_be_had_alone():
+def test_single_scan_equals_scan_of_drive():
     several = list(simulate_drive(3, 3, TINY))
     for i, scan in enumerate(several):
         alone = simulate_scan(3, i, TINY)
@@ -34,7 +33,7 @@ def test_any_scan_of_a_drive_can_be_had_alone():
     assert np.array_equal(several[0].pose, np.eye(4)) and several[2].pose[0, 3] > 0
 
 
-def test_columns_of_a_scan_fit_its_points():
+def test_columns_of_scan_agree_with_points():
     scan = simulate_scan(3, 7, TINY)
     xyz, n = scan.frame.xyz.astype(float), len(scan.frame)
     assert {scan.semantic.dtype, scan.instance.dtype, scan.ring.dtype} == {np.dtype(np.uint16)}
@@ -70,7 +69,7 @@ def test_object_layout_reads_back(made):
         same_objects(recorded.truth(), make_kitti_labels(scan.truth), 0.0051)
 
 
-def test_what_is_hidden_or_nearly_so_is_not_labelled_but_marked():
+def test_hidden_objects_become_dont_care():
     scan = simulate_scan(33, 0, SENSORS["hdl64e"], CROWDED_ZONES)
     seen = write_kitti.keep_visible_objects(scan.truth, FORWARD_CAMERA)
     labels = make_kitti_labels(scan.truth)
@@ -96,7 +95,7 @@ def test_tracking_layout_reads_back(made):
 
 
 def same_objects(found, expected, accuracy, truncation=None):
-    """Equal up to the digits of the text."""
+    """Assert that labels agree to the digits of the text."""
     assert found.labels == expected.labels
     assert [name for name, _ in found.notes] == [name for name, _ in expected.notes]
     for (_, a), (_, b) in zip(found.notes, expected.notes):
@@ -140,7 +139,7 @@ def test_semantickitti_layout_reads_back(made):
 @pytest.mark.parametrize("layout, inner", [
     ("kitti", "training/velodyne"), ("kitti-tracking", "training/velodyne/0000"),
     ("semantickitti", "sequences/00")])
-def test_a_low_sensor_is_low_in_every_layout(tmp_path, layout, inner):
+def test_sensor_height_is_kept_in_every_layout(tmp_path, layout, inner):
     low = tmp_path / "low"
     assert run(low, layout, 2, 1, "--mount-height", 0.6).exit_code == 0
     for path in (low, low / inner):
@@ -153,7 +152,7 @@ def test_a_low_sensor_is_low_in_every_layout(tmp_path, layout, inner):
         assert open_recording(low).frames[0].sensor_height == SENSOR_HEIGHT
 
 
-def test_a_bag_goes_on_with_the_next_street(tmp_path):
+def test_bag_continues_with_next_street(tmp_path):
     result = run(tmp_path / "bag", "mcap", 4, 1, "--streets-of", 2)
     assert result.exit_code == 0, result.output
     recording = list(open_recording(tmp_path / "bag"))
@@ -164,7 +163,7 @@ def test_a_bag_goes_on_with_the_next_street(tmp_path):
     assert np.diff(stamps).tolist() == [10**8, 101 * 10**8, 10**8]
 
 
-def test_2d_boxes_are_those_of_the_corners_in_the_image():
+def test_2d_boxes_contain_projected_corners():
     rng = np.random.default_rng(0)
     boxes = np.column_stack([rng.uniform(-10, 60, 300), rng.uniform(-20, 20, 300),
                              rng.uniform(-2, 1, 300), rng.uniform(0.3, 6, (300, 3)),
@@ -192,7 +191,7 @@ def test_2d_boxes_are_those_of_the_corners_in_the_image():
         assert (uv >= limits[:2] - 1e-6).all() and (uv <= limits[2:] + 1e-6).all()
 
 
-def test_2d_boxes_are_those_of_real_labels(data):
+def test_2d_boxes_agree_with_real_labels(data):
     worst, shares = [], []
     for frame in open_recording(data / "kitti_object"):
         truth = frame.truth()
@@ -213,7 +212,7 @@ def test_labels_without_objects_read_back(tmp_path):
     assert read_tracking_labels(tmp_path / "0000.txt", np.eye(4)) == {}
 
 
-def test_training_scans_are_the_streets_in_order():
+def test_training_scans_are_streets_in_order():
     for street, batch in zip((3, 4, 5), generate_training_scans(3, TINY)):
         scan = simulate_scan(street, 0, TINY)
         assert batch["points"].dtype == batch["boxes"].dtype == torch.float32
@@ -225,13 +224,13 @@ def test_training_scans_are_the_streets_in_order():
 
 
 class Streets(torch.utils.data.IterableDataset):
-    """What a user writes for a DataLoader."""
+    """Data set that a user writes for a DataLoader."""
 
     def __iter__(self):
         return itertools.islice(generate_training_scans(3, TINY), 2)
 
 
-def test_workers_of_a_loader_share_the_streets():
+def test_loader_workers_share_streets():
     expected = sorted(batch["points"].numpy().tobytes()
                       for batch in itertools.islice(generate_training_scans(3, TINY), 4))
     loader = torch.utils.data.DataLoader(Streets(), batch_size=None, num_workers=2)

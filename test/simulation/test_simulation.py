@@ -1,4 +1,4 @@
-"""Laws of the simulated drive."""
+"""Simulated drives."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ def street(seed):
 
 
 def scan(seed, t, sensor=COARSE):
-    """Hits, and the measured xyz and owner, of one moment of street(seed)."""
+    """Return hits, and measured xyz and owner, of one moment of a street."""
     scene = street(seed)
     moment = scene.at(t, sensor.height)
     hits = cast_rays(moment.solids, scene.ground, moment.position, sensor)
@@ -42,13 +42,13 @@ def test_same_seed_same_bytes():
     assert all(a[0] != b[0] for a, b in zip(first, content(1)))
 
 
-def test_a_longer_drive_starts_like_a_shorter_one():
+def test_longer_drive_starts_like_shorter_one():
     short, = simulate_drive(1, 1, COARSE)
     long = next(simulate_drive(1, 9, COARSE))
     assert np.array_equal(short.frame.xyz, long.frame.xyz)
 
 
-def test_frames_are_as_promised():
+def test_frames_have_documented_properties():
     for i, scan in enumerate(simulate_drive(0, 3, COARSE)):
         frame, found = scan.frame, scan.truth
         assert frame.xyz.dtype == frame.intensity.dtype == np.float32
@@ -68,7 +68,7 @@ def test_frames_are_as_promised():
 
 @pytest.mark.parametrize("t", [0.0, 3.9])
 @pytest.mark.parametrize("seed", [0, 2])
-def test_points_of_an_object_lie_in_its_box(seed, t):
+def test_points_of_object_are_in_its_box(seed, t):
     _, moment, hits, xyz, owner = scan(seed, t)
     semantic = make_returns(hits, COARSE, NO_MOTION, np.random.default_rng(0)).semantic
     for box, track, speed, kind in zip(moment.boxes, moment.track_ids, moment.speeds,
@@ -111,7 +111,7 @@ def test_pedestrians_walk_in_view_all_the_time():
 
 
 def test_order_of_objects_does_not_matter():
-    """But for glass and leaves, which let beams through by their place among the solids."""
+    """Except for glass and leaves, which pass beams by their index among the solids."""
     scene = street(1)
     order = np.random.default_rng(0).permutation(len(scene.actors))
     shuffled = replace(scene, actors=tuple(scene.actors[i] for i in order))
@@ -124,9 +124,9 @@ def test_order_of_objects_does_not_matter():
     assert len(moments[0].boxes) == len(moments[1].boxes)
 
 
-def test_scans_look_like_those_of_the_real_sensor():
-    """Numbers of KITTI's scans: 109 000 to 127 000 points, and on a pedestrian in full view
-    about 27 000 over the square of its range."""
+def test_scans_resemble_those_of_real_sensor():
+    """KITTI's scans have 109 000 to 127 000 points, and about 27 000 / range^2 on a pedestrian in
+    full view."""
     density, labels = [], set()
     for seed in (0, 33):
         scan = next(simulate_drive(seed, 1, scenes=CROWDED_ZONES))

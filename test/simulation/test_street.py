@@ -1,4 +1,4 @@
-"""Laws of the streets that are simulated: who stands and moves where."""
+"""Simulated streets: positions and motion of their actors."""
 
 from dataclasses import fields, replace
 from functools import cache
@@ -34,7 +34,7 @@ scene_of = cache(lambda kind, seed, people=1.0: make_scene(seed, kind, people))
 
 
 def flat_boxes(footprints, t):
-    """(M, 7) boxes [x y 0 l w 1 heading] in the world of footprints (M, 8) at time t."""
+    """Return boxes (M, 7) [x y 0 l w 1 heading] of footprints (M, 8) at time t, in the world."""
     middle = compute_centres(footprints, np.array([t]))[:, 0]
     one, zero = np.ones(len(middle)), np.zeros(len(middle))
     return np.column_stack([middle, zero, 2 * footprints[:, LENGTH:WIDTH + 1], one,
@@ -42,8 +42,7 @@ def flat_boxes(footprints, t):
 
 
 def overlaps(boxes, many):
-    """(n, 2) pairs of one of the first many boxes (M, 7) and one after it whose footprints share
-    more than a line."""
+    """Return pairs (n, 2) of one of the first `many` boxes (M, 7) and a later one that overlap."""
     corner = box_corners(boxes)[:, :4, :2]
     first, second = np.nonzero(np.arange(many)[:, None] < np.arange(len(boxes)))
     reach = np.hypot(boxes[:, 3], boxes[:, 4]) / 2
@@ -76,8 +75,7 @@ def test_same_seed_same_street():
 
 @pytest.mark.parametrize("kind, seed", EVERY)
 def test_nothing_ever_overlaps(kind, seed):
-    """Labels, everything else, and the ego vehicle, in the plane; but people sit on benches, and
-    plants grow into one another and into walls."""
+    """Labelled and unlabelled things and the ego vehicle, except people on benches and plants."""
     scene = scene_of(kind, seed)
     props = [a for a in scene.actors if not a.thing.label]
     plants = np.array([is_plant(a) for a in props])
@@ -94,7 +92,7 @@ def test_nothing_ever_overlaps(kind, seed):
 
 
 @pytest.mark.parametrize("kind, seed", EVERY)
-def test_everything_is_on_the_ground(kind, seed):
+def test_everything_is_on_ground(kind, seed):
     scene = scene_of(kind, seed)
     m = scene.at(5.0, HEIGHT)
     world = m.boxes[:, :3] + m.position
@@ -115,7 +113,7 @@ def test_everything_is_on_the_ground(kind, seed):
 
 
 @pytest.mark.parametrize("kind, seed", EVERY)
-def test_boxes_move_as_their_speed_says(kind, seed):
+def test_boxes_move_with_their_speed(kind, seed):
     scene, dt = scene_of(kind, seed), 0.5
     for t in (0.0, 9.0):
         one, two = scene.at(t, HEIGHT), scene.at(t + dt, HEIGHT)
@@ -137,7 +135,7 @@ def test_boxes_move_as_their_speed_says(kind, seed):
 
 
 @pytest.mark.parametrize("kind, seed", EVERY)
-def test_nobody_tailgates_the_ego_vehicle(kind, seed):
+def test_no_vehicle_is_close_to_ego_vehicle(kind, seed):
     scene = scene_of(kind, seed)
     for t in (0.0, 10.0, 20.0):
         m = scene.at(t, HEIGHT)
@@ -147,7 +145,7 @@ def test_nobody_tailgates_the_ego_vehicle(kind, seed):
         assert (gap > 0.6 * scene.way.speed).all()
 
 
-def test_solids_carry_the_velocity_and_the_class_of_their_owner():
+def test_solids_have_velocity_and_class_of_owner():
     for kind in STREET_KINDS:
         m = scene_of(kind, 0).at(3.0, HEIGHT)
         speed = dict(zip(m.track_ids, m.speeds))
@@ -158,7 +156,7 @@ def test_solids_carry_the_velocity_and_the_class_of_their_owner():
         assert (m.solids.semantic > 0).all() and (m.solids.half > 0).all()
 
 
-def test_what_stands_between_the_directions_is_at_crossings_and_leaves_the_lanes_free():
+def test_islands_are_at_crossings_and_off_lanes():
     found = 0
     for kind, seed in EVERY:
         scene = scene_of(kind, seed)
@@ -172,7 +170,7 @@ def test_what_stands_between_the_directions_is_at_crossings_and_leaves_the_lanes
     assert found > 10
 
 
-def test_streets_hold_what_kitti_labels():
+def test_streets_have_objects_that_kitti_labels():
     """In the forward camera's view and within 30 m, the 57 labelled frames beside the checkout
     have 1.7 cars, 0.19 pedestrians and 0.14 cyclists, fewer than stand there: what is hidden has
     no label. They are few (11 pedestrians, 8 cyclists), so the bands are wide."""
@@ -194,14 +192,14 @@ def test_streets_hold_what_kitti_labels():
     assert (found.sum(axis=0)[:len(CLASSES) - 1] > 0).sum() >= 6
 
 
-def test_as_many_people_as_asked_for():
+def test_people_option_scales_number_of_people():
     def people(factor):
         labels = [a.thing.label for a in scene_of("residential", 0, factor).actors]
         return sum(label in ("Pedestrian", "Person_sitting", "Cyclist") for label in labels)
     assert people(0.0) == 0 < people(1.0) < people(4.0) / 2
 
 
-def test_a_moment_without_objects_has_the_shapes_of_others():
+def test_moment_without_objects_has_empty_arrays():
     scene = replace(scene_of("country", 0), actors=())
     m = scene.at(0.0, HEIGHT)
     assert len(m.solids) == 0 and m.solids.axes.shape == (0, 3, 3)
@@ -219,7 +217,7 @@ def test_impossible_arguments_are_named(arguments, named):
     assert "\n" not in str(error.value)
 
 
-def test_meet_equals_many_looks_at_short_intervals():
+def test_footprints_touch_equals_dense_sampling():
     rng = np.random.default_rng(0)
     rows = rng.uniform((-6, -6, -3, 0.3, 0.2, 0, 0, 0), (6, 6, 3, 2.5, 1.2, 3, 2, 6), (120, 8))
     rows[::3, SPEED] = 0.0

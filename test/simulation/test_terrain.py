@@ -1,4 +1,4 @@
-"""Laws of the ground that rays meet."""
+"""Rays on the ground."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ from lidar_perception.simulation.terrain import (
 pytestmark = pytest.mark.no_cover  # others run these lines
 
 
-def test_flat_ground_is_at_height_over_sine():
+def test_flat_ground_range_is_height_over_sine():
     plain = replace(SENSOR, lifts=())
     hits = cast_rays(crowd(0, 0), Ground(), OVER_ROAD, plain)
     sine = -np.sin(np.array(plain.elevations))
@@ -44,7 +44,7 @@ def on_ground(ground, position=(3.0, 0.4), sensor=None):
 @pytest.mark.parametrize("ground", [
     FULL, FULL._replace(crossings=()), FULL._replace(wave=0.0, camber=0.05),
     Ground(0.02, -0.03, 0.1)])
-def test_the_ground_is_met_where_it_is(ground):
+def test_hit_is_on_surface_of_ground(ground):
     at, semantic, met, _ = on_ground(ground)
     x, y, z = at.T
     off = z - surface_height(ground, x, y)
@@ -58,7 +58,7 @@ def test_the_ground_is_met_where_it_is(ground):
         assert curb.sum() > 50 and (y > ground.curb_left).any() and (y < ground.curb_right).any()
 
 
-def test_no_ray_passes_through_the_ground():
+def test_no_ray_passes_through_ground():
     _, _, met, hits = on_ground(FULL)
     sensor = replace(SENSOR, azimuth_step=np.radians(0.5))
     turn, start = make_rays(sensor), np.array([3.0, 0.4, surface_height(FULL, 3.0, 0.4) + 1.7])
@@ -68,7 +68,7 @@ def test_no_ray_passes_through_the_ground():
         assert (z - surface_height(FULL, x, y)).min() > -2e-3
 
 
-def test_classes_of_the_ground_are_where_they_belong():
+def test_ground_classes_are_in_place():
     at, semantic, _, _ = on_ground(FULL, sensor=replace(SENSOR, azimuth_step=np.radians(0.25)))
     x, y, _ = at.T
     crossing = ((x > 8) & (x < 15)) | ((x > -30) & (x < -22))
@@ -81,7 +81,7 @@ def test_classes_of_the_ground_are_where_they_belong():
     assert set(np.unique(semantic)) == {40, 44, 48, 72}
 
 
-def test_rough_ground_lies_within_its_roughness_and_stays_where_it_is():
+def test_rough_ground_is_bounded_and_constant():
     rough = FULL._replace(rough=0.08, litter=0.04)
     (at, semantic, _, _), (again, *_) = on_ground(rough), on_ground(rough)
     assert np.array_equal(at, again)
@@ -94,7 +94,7 @@ def test_rough_ground_lies_within_its_roughness_and_stays_where_it_is():
     assert np.isfinite(on_ground(rough, (4.0, 0.4))[0]).all()
 
 
-def test_grass_is_rough_at_every_range_and_hides_what_is_behind_it():
+def test_grass_is_rough_and_hides_ground_behind():
     meadow = Ground(curb_left=2.0, curb_right=-2.0, walk=0.0, rough=0.6)
     at, _, met, hits = on_ground(meadow, sensor=HDL64E)
     above = at[:, 2] - surface_height(meadow, at[:, 0], at[:, 1])
@@ -108,7 +108,7 @@ def test_grass_is_rough_at_every_range_and_hides_what_is_behind_it():
 
 @njit
 def first_below_tufts(ground, start, way):
-    """The first range, 5 mm by 5 mm, at which a ray is below the tufts."""
+    """Return the first range, in steps of 5 mm, at which a ray is below the tufts."""
     t = 0.0
     while t < 30.0 and start[2] + t * way[2] >= tuft_height(ground, start[0] + t * way[0],
                                                             start[1] + t * way[1], 0.0):
@@ -116,7 +116,7 @@ def first_below_tufts(ground, start, way):
     return t
 
 
-def test_tufts_are_met_where_a_slow_march_meets_them():
+def test_tuft_hits_equal_slow_march():
     rng = np.random.default_rng(1)
     meadow = Ground(curb_left=2.0, curb_right=-2.0, walk=0.0, rough=0.5)
     yaw, down = rng.uniform(0.3, 2.8, 400), rng.uniform(0.06, 0.3, 400)
@@ -129,8 +129,8 @@ def test_tufts_are_met_where_a_slow_march_meets_them():
 
 
 @pytest.mark.parametrize("height, least", [(0.3, 0.0), (0.02, -1e-9)])
-def test_nothing_is_met_behind_a_low_sensor(height, least):
-    """Beside a meadow whose tufts are higher than it, and among the bumps of the road."""
+def test_no_hit_behind_low_sensor(height, least):
+    """Next to a meadow whose tufts are higher than the sensor, and among bumps of the road."""
     meadow = Ground(curb_left=1.0, curb_right=-1.0, walk=0.0, rough=0.8)
     low = replace(SENSOR, height=height, lifts=())
     hits = cast_rays(crowd(0, 0), meadow, np.array([0.0, 0.0, height]), low)

@@ -1,4 +1,4 @@
-"""Laws of the things in a street: their sizes, what they are made of, and how they walk."""
+"""Things of a scene: sizes, parts and poses."""
 
 from functools import cache, partial
 
@@ -50,7 +50,7 @@ SEMANTICS = {10, 11, 15, 16, 18, 20, 30, 31, 50, 51, 70, 71, 80, 81, 99}
 
 
 def made_by(make, seed):
-    """Parts of a thing, labelled or not."""
+    """Return the parts of a thing, labelled or not."""
     thing = make(np.random.default_rng(seed))
     return thing.parts(0.7) if hasattr(thing, "parts") else thing
 
@@ -65,7 +65,7 @@ def stride(thing):
 
 
 @pytest.mark.parametrize("name", [*LABELLED, *SCENERY])
-def test_parts_are_sound(name):
+def test_parts_are_valid(name):
     make, most = {**LABELLED, **SCENERY}[name]
     for seed in SEEDS:
         made = made_by(make, seed)
@@ -80,14 +80,14 @@ def test_parts_are_sound(name):
 
 
 @pytest.mark.parametrize("name", [*LABELLED, *SCENERY])
-def test_the_same_seed_gives_the_same_thing(name):
+def test_same_seed_gives_same_thing(name):
     make, _ = {**LABELLED, **SCENERY}[name]
     assert made_by(make, 5).tobytes() == made_by(make, 5).tobytes()
     assert made_by(make, 5).tobytes() != made_by(make, 6).tobytes()
 
 
 @pytest.mark.parametrize("name", LABELLED)
-def test_the_box_of_a_labelled_thing_is_what_its_body_covers(name):
+def test_box_covers_body_of_labelled_thing(name):
     make, _ = LABELLED[name]
     for seed in SEEDS:
         thing = make(np.random.default_rng(seed))
@@ -105,7 +105,7 @@ def test_the_box_of_a_labelled_thing_is_what_its_body_covers(name):
 
 
 @pytest.mark.parametrize("name", ["walker", "child", "stander", "backpack"])
-def test_the_box_of_a_pedestrian_holds_for_a_whole_stride(name):
+def test_box_of_pedestrian_holds_for_whole_stride(name):
     make, _ = LABELLED[name]
     for seed in SEEDS:
         thing = make(np.random.default_rng(seed))
@@ -120,7 +120,7 @@ def test_the_box_of_a_pedestrian_holds_for_a_whole_stride(name):
             assert abs(high[:, 0].max() - thing.size[0] / 2) < 0.01
 
 
-def test_a_foot_on_the_ground_does_not_slide():
+def test_foot_on_ground_does_not_slide():
     for seed in SEEDS:
         thing = people.make_pedestrian(np.random.default_rng(seed), 1.3)
         ways = np.linspace(0, stride(thing), 401)
@@ -134,7 +134,7 @@ def test_a_foot_on_the_ground_does_not_slide():
         assert 0.5 < stands.mean() < 0.7
 
 
-def test_a_walk_repeats_after_a_stride_and_mirrors_after_a_step():
+def test_walk_repeats_after_stride_and_mirrors_after_step():
     thing = people.make_pedestrian(np.random.default_rng(3), 1.4)
     now, later = thing.parts(0.2), thing.parts(0.2 + stride(thing))
     assert np.allclose(now["centre"], later["centre"])
@@ -144,8 +144,8 @@ def test_a_walk_repeats_after_a_stride_and_mirrors_after_a_step():
     assert np.allclose(np.sort(high[:, 1]), np.sort(-low_step[:, 1]))
 
 
-def test_limbs_hold_together():
-    """Between their joints, limbs keep their length; knees bend forward."""
+def test_limbs_are_connected_and_keep_length():
+    """Limbs keep their length between joints; knees bend forward."""
     thing = people.make_pedestrian(np.random.default_rng(4), 1.4)
     height = thing.size[2]
     for x in np.linspace(0, stride(thing), 50):
@@ -161,7 +161,7 @@ def test_faster_walkers_take_longer_steps():
 
 
 @pytest.mark.parametrize("carried", people.CARRIED[1:])
-def test_what_is_carried_changes_no_width_or_height_of_the_box(carried):
+def test_load_does_not_change_width_or_height_of_box(carried):
     plain = people.make_pedestrian(np.random.default_rng(2), 1.2)
     loaded = people.make_pedestrian(np.random.default_rng(2), 1.2, carried=carried)
     assert len(loaded.parts(0.0)) > len(plain.parts(0.0))
@@ -170,7 +170,7 @@ def test_what_is_carried_changes_no_width_or_height_of_the_box(carried):
     assert abs(low[2]) < 1e-9
 
 
-def test_wheels_stay_on_the_road_while_pedals_turn():
+def test_wheels_stay_on_road_while_pedals_turn():
     for seed in SEEDS:
         thing = cyclists.make_cyclist(np.random.default_rng(seed))
         poses = [thing.parts(x) for x in np.linspace(0, 5, 41)]
@@ -182,7 +182,7 @@ def test_wheels_stay_on_the_road_while_pedals_turn():
 
 
 @pytest.mark.parametrize("style", ["HATCHBACK", "SEDAN", "ESTATE", "SUV", "MINIBUS", "PANEL_VAN"])
-def test_vehicles_are_alike_left_and_right(style):
+def test_vehicles_are_symmetric(style):
     made = vehicles.make_body((4.2, 1.7, 1.6), getattr(vehicles, style), 0.3, 0.8, driver=False)
     low, high = compute_extents(made)
     mirrored = np.stack([low[:, 0], -high[:, 1], low[:, 2], high[:, 0], -low[:, 1], high[:, 2]], 1)
@@ -191,8 +191,8 @@ def test_vehicles_are_alike_left_and_right(style):
     assert far.max() < 1e-9
 
 
-def test_a_beam_from_the_side_can_pass_a_car_between_its_panes():
-    """Above the belt, behind the screens, there is nothing solid but pillars and seats."""
+def test_beam_can_pass_through_windows_of_car():
+    """Above the belt and behind the screens only pillars and seats are solid."""
     made = vehicles.make_body((4.0, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.85, driver=False)
     low, high = compute_extents(made)
     x, z = -0.45, 1.25  # between the pillars in the middle and at the back, above the seats
@@ -201,7 +201,7 @@ def test_a_beam_from_the_side_can_pass_a_car_between_its_panes():
 
 
 def points_of(thing, distance, yaw, seed):
-    """xyz that the HDL-64E has of a thing, alone in the world, so far ahead; z above its bottom."""
+    """Return the xyz that the HDL-64E sees of a thing at a distance ahead; z above its bottom."""
     made = thing.parts(0.4 * seed)
     base = np.tile([distance, 0.0, -1.73], (len(made), 1))
     solids = place_parts(made, base, np.full(len(made), yaw), np.ones(len(made)),
@@ -211,8 +211,8 @@ def points_of(thing, distance, yaw, seed):
     return xyz + np.array([0.0, 0.0, 1.73])
 
 
-def test_as_much_of_a_cyclist_is_low_as_of_those_of_kitti():
-    """Below 0.42 of the height lie 46 % of the points of 10 of KITTI's."""
+def test_low_share_of_cyclist_agrees_with_kitti():
+    """Of 10 cyclists of KITTI 46 % of the points are below 0.42 of the height."""
     shares = []
     for seed in SEEDS:
         thing = cyclists.make_cyclist(np.random.default_rng(seed))
@@ -223,9 +223,9 @@ def test_as_much_of_a_cyclist_is_low_as_of_those_of_kitti():
 
 @pytest.mark.parametrize("distance, low, high", [(20.0, 0.22, 0.32), (33.0, 0.20, 0.32),
                                                  (48.0, 0.08, 0.25)])
-def test_little_of_a_car_is_above_its_belt_and_the_farther_the_less(distance, low, high):
-    """Above 0.65 of the height lie 38, 31 and 16 % of the points of 22, 17 and 15 cars that are
-    seen from behind, 12 to 25, 25 to 40 and 40 to 70 m away, in streets, which hide what is low."""
+def test_share_above_belt_of_car_falls_with_range(distance, low, high):
+    """On KITTI 38, 31 and 16 % of the points are above 0.65 of the height, of 22, 17 and 15 cars
+    seen from behind at 12 to 25, 25 to 40 and 40 to 70 m, whose lower parts are often hidden."""
     shares = []
     for seed in range(16):
         thing = vehicles.make_car(np.random.default_rng(seed))
@@ -237,7 +237,7 @@ def test_little_of_a_car_is_above_its_belt_and_the_farther_the_less(distance, lo
 
 @cache
 def cars_from_the_front():
-    """24 cars, and their points from 20 m away."""
+    """Return 24 cars and their points from 20 m away."""
     cars = [vehicles.make_car(np.random.default_rng(seed)) for seed in range(24)]
     return [(car, points_of(car, 20.0, np.pi + 0.05 * (seed % 5 - 2), seed))
             for seed, car in enumerate(cars)]
@@ -245,9 +245,9 @@ def cars_from_the_front():
 
 @pytest.mark.parametrize("zone, low, high", [((0.15, 0.35), 0.04, 0.10), ((0.35, 0.55), 0.12, 0.24),
                                              ((0.55, 0.65), 0.45, 0.75)])
-def test_only_the_bumper_of_a_car_is_as_far_in_front_as_its_box(zone, low, high):
-    """A quarter of the points of a zone of heights, shares of the car's, are less than 0.07, 0.17
-    and 0.60 m behind the end of the box: medians over 42 to 59 of KITTI's, seen from the front."""
+def test_only_bumper_reaches_front_of_box(zone, low, high):
+    """A quarter of the points of a zone of heights are within 0.07, 0.17 and 0.60 m of the end of
+    the box: medians of 42 to 59 cars of KITTI seen from the front."""
     depths = []
     for thing, points in cars_from_the_front():
         x, y, z = points.T
@@ -258,14 +258,14 @@ def test_only_the_bumper_of_a_car_is_as_far_in_front_as_its_box(zone, low, high)
 
 
 @pytest.mark.parametrize("length", [3.2, 3.8, 4.5])
-def test_seats_do_not_tell_how_long_a_car_is(length):
+def test_seats_do_not_reveal_length_of_car(length):
     made = vehicles.make_body((length, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.8, driver=False)
     seats = made[np.isclose(made["transmission"], 0.75)]
     assert len(seats) == 2 and np.ptp(seats["centre"][:, 0]) > 0.4
 
 
 @pytest.mark.parametrize("label", SIZES)
-def test_sizes_spread_as_in_the_table(label):
+def test_sizes_have_spread_of_table(label):
     rng = np.random.default_rng(0)
     sizes = np.array([draw_size(rng, label) for _ in range(4000)])
     mean, spread, together = SIZES[label]
@@ -275,8 +275,8 @@ def test_sizes_spread_as_in_the_table(label):
     assert (sizes > 0.2).all()
 
 
-def test_sizes_are_those_of_the_labels(data):
-    """The table is what the labels of the sample say, to the digits that it gives."""
+def test_size_table_agrees_with_labels(data):
+    """The table agrees with the labels of the sample to its digits."""
     rows = {}
     for path in (data / "kitti_object/training/label_2").glob("*.txt"):
         for line in path.read_text().splitlines():
@@ -295,14 +295,14 @@ def test_sizes_are_those_of_the_labels(data):
 
 
 @pytest.mark.parametrize("name", SCENERY)
-def test_scenery_stands_on_or_in_the_ground(name):
+def test_scenery_is_on_or_in_ground(name):
     make, _ = SCENERY[name]
     for seed in SEEDS:
         low, high = hull(made_by(make, seed))
         assert low[2] <= 1e-9 < high[2]
 
 
-def test_rods_and_discs_end_where_they_should():
+def test_rods_and_discs_have_given_ends():
     made = parts([rod((0, 0, 0), (3, 4, 12), 1e-6), disc((1, 2, 3), 0.5, 0.1),
                   block((1, -1, 2), (0, 1, 0))], 10)
     low, high = compute_extents(made)

@@ -1,4 +1,4 @@
-"""Things and ground to cast rays at."""
+"""Solids and ground to cast rays at."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ FULL = Ground(0.01, -0.02, 0.05, 20.0, 0.02, 6.0, -4.0, 0.13, 2.0, ((8.0, 15.0),
 
 def solids(kind, centre, half, owner=1, axes=None, density=np.inf, transmission=0.0,
            velocity=(0.0, 0.0, 0.0)):
-    """Solids of P kinds, centres and half sizes; the rest as given for each or for all."""
+    """Return solids of P kinds, centres and half sizes; other values for each or for all."""
     kind, centre = np.atleast_1d(np.array(kind, np.int8)), np.atleast_2d(np.array(centre, float))
     n = len(kind)
     axes = np.eye(3) if axes is None else axes
@@ -29,7 +29,7 @@ def solids(kind, centre, half, owner=1, axes=None, density=np.inf, transmission=
 
 
 def crowd(seed, count=60, moving=True):
-    """Solids of all kinds, turned anyhow, around the sensor and some far away."""
+    """Return random solids of all kinds around the sensor, some far away."""
     rng = np.random.default_rng(seed)
     axes = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
     bearing, far = rng.uniform(-np.pi, np.pi, count), rng.uniform(4, 70, count)

@@ -1,4 +1,4 @@
-"""Small simulated data sets by way of the command."""
+"""Small simulated data sets made by the command."""
 
 from click.testing import CliRunner
 

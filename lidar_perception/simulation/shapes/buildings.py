@@ -1,4 +1,4 @@
-"""Houses: a front with real openings, glass in them and rooms behind."""
+"""Buildings: a front with glazed openings and rooms behind."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ from lidar_perception.simulation.shapes.thing import GLASS, METAL, block
 from lidar_perception.simulation.solids import parts
 
 BUILDING = 50
-FOOT_M = -1.0  # how deep a house reaches into the ground, m
-ROOM_DEPTH_M = 3.0  # depth of the rooms behind the front, m
+FOOT_M = -1.0  # bottom of a house, in the ground
+ROOM_DEPTH_M = 3.0  # behind the front
 
 
 def make_building(rng: np.random.Generator, length: float, depth: float,
                   storeys: int) -> np.ndarray:
-    """(P,) PART of a house along x, centred, whose front is at y = 0 and looks to -y; depth at
-    least 4 m. Piers and deep bands, which are the floors, leave the windows open; a beam goes
-    through the glass or not. Base, sills, balconies and the edge of the roof stand out of the
-    front by up to 1.2 m; at most 40 parts for 15 m and four storeys."""
+    """Make a house (P,) PART along x, centred, with its front at y = 0 towards -y.
+
+    The windows are between piers and the floors; beams pass the glass at random. Base, sills,
+    balconies and the edge of the roof protrude by up to 1.2 m. The depth is at least 4 m. At most
+    40 parts for 15 m and four storeys.
+    """
     x, tone = length / 2, rng.uniform(0.25, 0.55)  # half of SemanticKITTI's: 0.34 to 0.52
     ground, storey = rng.uniform(2.9, 3.8), rng.uniform(2.7, 3.2)
     floors = [ground + storey * i for i in range(storeys)]  # the upper faces of the ceilings
@@ -53,9 +55,11 @@ def make_building(rng: np.random.Generator, length: float, depth: float,
 
 
 def make_glass_hall(rng: np.random.Generator, length: float, depth: float) -> np.ndarray:
-    """(P,) PART of a hall along x, centred, whose front at y = 0, which looks to -y, is all glass
-    between posts: a beam goes through or not, and then on to columns and walls within. A roof
-    stands out of it; at most 40 parts for 30 m."""
+    """Make a hall (P,) PART along x, centred, with a glass front between posts at y = 0 towards -y.
+
+    Beams pass the glass at random, and then hit columns and walls inside. The roof protrudes. At
+    most 40 parts for 30 m.
+    """
     x, high, wall = length / 2, rng.uniform(3.5, 8.0), dict(reflectance=rng.uniform(0.35, 0.6))
     posts = np.linspace(-x, x, max(int(length / rng.uniform(1.8, 3.5)), 1) + 1)
     rows = [block((-x, 0.04, 0.05), (x, 0.06, high), reflectance=GLASS,
@@ -75,7 +79,7 @@ def make_glass_hall(rng: np.random.Generator, length: float, depth: float) -> np
 
 def _decorate_front(rng: np.random.Generator, below: float, sill: float, x: float,
                     places: list[float], pitch: float) -> list[tuple]:
-    """A sill along an upper storey, or a balcony on it, or nothing."""
+    """Return a sill along an upper storey, a balcony, or nothing."""
     pick = rng.random()
     if pick < 0.35:
         return [block((-x, -0.08, below + sill - 0.08), (x, 0.05, below + sill), reflectance=0.4)]

@@ -24,16 +24,22 @@ from lidar_perception.simulation.shapes.thing import (
 from lidar_perception.simulation.solids import BOX, ELLIPSOID, part, parts
 
 BICYCLE, MOTORCYCLE, BICYCLIST = 11, 15, 31
-CRANK_M, GEAR_M = 0.17, 5.0  # metres: length of a crank, way for one turn of the cranks
+CRANK_M, GEAR_M = 0.17, 5.0  # length of a crank, distance per turn of the cranks
 SPOKE_TRANSMISSION = 0.5            # share of the beams that pass between the spokes
 FRAME_TRANSMISSION = 0.6  # between stays, chain and pedals, and through the rack
 THIGH, SHANK = 0.26, 0.27  # lengths as shares of the rider's height, down to the pedal
 
 
 class RiderBuild(NamedTuple):
-    """A rider on a bicycle. size: length, width, height in metres; lean: of the trunk, radians;
-    phase: of the cranks, radians; frame, coat, trousers, head: reflectances; load: "", "basket",
-    or "backpack"."""
+    """A rider on a bicycle.
+
+    Attributes:
+        size: Length, width, height in m.
+        lean: Tilt of the trunk, rad.
+        phase: Angle of the cranks, rad.
+        frame, coat, trousers, head: Reflectances.
+        load: "", "basket" or "backpack".
+    """
 
     size: tuple[float, float, float]
     lean: float
@@ -46,7 +52,7 @@ class RiderBuild(NamedTuple):
 
 
 def make_cyclist(rng: np.random.Generator) -> Thing:
-    """Someone who rides; the box's length is the bicycle's, its width the handlebar's."""
+    """Make a riding cyclist; the box has the length of the bicycle and width of the handlebar."""
     size = draw_size(rng, CLASSES[CYCLIST])
     rider = RiderBuild(size, rng.uniform(0.15, 0.6), rng.uniform(0, 2 * pi), rng.uniform(0.1, 0.8),
                        rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75), rng.uniform(0.15, 0.75),
@@ -55,8 +61,10 @@ def make_cyclist(rng: np.random.Generator) -> Thing:
 
 
 def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
-    """(P,) PART of a rider after so many metres; the cranks turn, the wheels are discs that let
-    half of the beams pass."""
+    """Return the parts (P,) PART of a rider after a distance in m.
+
+    The cranks turn; the wheels are discs that half of the beams pass.
+    """
     length, width, height = rider.size
     seat = 0.53 * height
     trunk = (height - seat) / (0.31 * cos(rider.lean) + 0.16)  # the rider's height
@@ -100,9 +108,11 @@ def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
 
 
 def _bicycle_parts(length: float, half_bar: float, bar: tuple, frame: float) -> list[tuple]:
-    """Wheels, what is between and above them, tubes and handlebar, with bar (x, z). As thick as
-    wide beams see it: 46 % of the points of KITTI's cyclists are lower than 0.42 of their height,
-    22 % also more than 0.35 m ahead of the middle or behind it (10 cyclists up to 40 m)."""
+    """Return wheels, tubes, handlebar at bar (x, z), and what is between and above the wheels.
+
+    Parts are as thick as wide beams see them: 46 % of the points of KITTI's cyclists are lower than
+    0.42 of their height, 22 % also more than 0.35 m from the centre (10 cyclists up to 40 m).
+    """
     radius = 0.19 * length
     axle, crank = length / 2 - radius, (-0.02 * length, 0.0, 0.88 * radius)
     wheel = dict(reflectance=0.3, transmission=SPOKE_TRANSMISSION)
@@ -116,7 +126,7 @@ def _bicycle_parts(length: float, half_bar: float, bar: tuple, frame: float) -> 
 
 
 def make_bicycle(rng: np.random.Generator) -> np.ndarray:
-    """(P,) PART of a bicycle that stands, with a reflector that shines."""
+    """Make a parked bicycle (P,) PART with a reflector."""
     length = rng.uniform(1.6, 1.85)
     seat = (-0.15 * length, 0.92)
     rows = [*_bicycle_parts(length, 0.3, (0.22 * length, 1.02), rng.uniform(0.05, 0.5)),
@@ -126,7 +136,7 @@ def make_bicycle(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_motorcycle(rng: np.random.Generator) -> np.ndarray:
-    """(P,) PART of a motorcycle or scooter that stands."""
+    """Make a parked motorcycle or scooter (P,) PART."""
     length, paint = rng.uniform(1.8, 2.2), rng.uniform(0.05, 0.5)
     radius = rng.uniform(0.25, 0.31)
     axle = length / 2 - radius

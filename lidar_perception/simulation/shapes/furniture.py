@@ -1,5 +1,7 @@
-"""What stands along a street; much of it has the size of a person. Each function returns (P,)
-PART with P <= 8. What is fixed reaches some way into the ground. With a front it looks to +x."""
+"""Street furniture, much of it of a person's size.
+
+Each function returns (P,) PART. Fixed things reach into the ground. Fronts face +x.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +11,16 @@ from lidar_perception.simulation.shapes.thing import GLASS, METAL, PLATE, RUBBER
 from lidar_perception.simulation.solids import CYLINDER, ELLIPSOID, part, parts
 
 BUILDING, FENCE, VEGETATION, POLE, SIGN, OTHER = 50, 51, 70, 80, 81, 99
-FOOT_M = -0.3  # foot of what is fixed, m
+FOOT_M = -0.3  # bottom of fixed things, in the ground
 
 
 def make_pole(rng: np.random.Generator) -> np.ndarray:
-    """A bare mast of 2.5 to 8 m."""
+    """Make a bare mast of 2.5 to 8 m."""
     return parts([_post(rng.uniform(2.5, 8.0), rng.uniform(0.04, 0.12))], POLE)
 
 
 def make_lamp(rng: np.random.Generator) -> np.ndarray:
-    """A street lamp of 4 to 8 m: mast, base with a door, arm to +x, head."""
+    """Make a street lamp of 4 to 8 m: mast, base with a door, arm to +x, head."""
     height, arm = rng.uniform(4.0, 8.0), rng.uniform(0.4, 1.5)
     return parts([_post(height, 0.06), _post(1.1, 0.09),
                   rod((0, 0, height), (arm, 0, height + 0.1), 0.03, reflectance=METAL),
@@ -27,7 +29,7 @@ def make_lamp(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_traffic_light(rng: np.random.Generator) -> np.ndarray:
-    """A mast with lights at 2.2 m, a box with a button, and most often a sign or two below."""
+    """Make a mast with lights at 2.2 m, a button, and up to two signs below."""
     height, own = rng.uniform(3.0, 3.5), rng.spawn(1)[0]
     rows = [_post(height, 0.07),
             block((0.08, -0.15, height - 0.95), (0.3, 0.15, height), reflectance=0.05),
@@ -38,8 +40,11 @@ def make_traffic_light(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_sign(rng: np.random.Generator) -> np.ndarray:
-    """One or two plates that shine, to +x, on a post; some hang low, as on islands, half of these
-    on a mast. Of KITTI's clusters as wide as a person, 15 % shine in part, most of them low."""
+    """Make a post with one or two retroreflective plates to +x; some are low, as on islands.
+
+    Half of the low ones are on a mast. Of KITTI's clusters as wide as a person, 15 % are partly
+    retroreflective, most of them low.
+    """
     low = rng.uniform(1.7, 2.2) if rng.random() < 0.6 else rng.uniform(0.4, 1.0)
     size, own = rng.uniform(0.25, 0.4), rng.spawn(1)[0]
     plates = [(low, size)] + ([(low + 2 * size + 0.05, 0.2)] if rng.random() < 0.4 else [])
@@ -49,13 +54,15 @@ def make_sign(rng: np.random.Generator) -> np.ndarray:
 
 
 def _plate(x: float, z: float, half: float) -> tuple:
-    """The plate of a sign at x, from z up, so far to each side."""
+    """Return the plate of a sign at x with its bottom at z."""
     return block((x, -half, z), (x + 0.02, half, z + 2 * half), reflectance=PLATE, semantic=SIGN)
 
 
 def make_fence(rng: np.random.Generator, length: float) -> np.ndarray:
-    """A fence along x, centred: posts, two rails and bars or boards with gaps, which a beam meets
-    the more the flatter it comes."""
+    """Make a fence along x, centred: posts, two rails, and bars or boards with gaps.
+
+    Beams at flatter angles hit the bars more often.
+    """
     height, x = rng.uniform(0.8, 1.9), length / 2
     rows = [rod((at, 0, -0.5), (at, 0, height), 0.04, reflectance=METAL)
             for at in np.linspace(0.04 - x, x - 0.04, 5)]
@@ -67,7 +74,7 @@ def make_fence(rng: np.random.Generator, length: float) -> np.ndarray:
 
 
 def make_wall(rng: np.random.Generator, length: float) -> np.ndarray:
-    """A garden wall along x, centred, with a coping and piers at its ends."""
+    """Make a garden wall along x, centred, with a coping and piers at its ends."""
     height, x, tone = rng.uniform(0.5, 2.2), length / 2, rng.uniform(0.3, 0.5)
     rows = [block((-x, -0.12, -0.6), (x, 0.12, height), reflectance=tone),
             block((-x, -0.16, height), (x, 0.16, height + 0.06), reflectance=0.4)]
@@ -77,7 +84,7 @@ def make_wall(rng: np.random.Generator, length: float) -> np.ndarray:
 
 
 def make_litter_bin(rng: np.random.Generator) -> np.ndarray:
-    """A round bin that stands, or one that hangs on a post."""
+    """Make a standing round litter bin, or one on a post."""
     grey = rng.uniform(0.1, 0.5)
     if rng.random() < 0.5:
         high, radius = rng.uniform(0.7, 1.2), rng.uniform(0.2, 0.35)
@@ -89,7 +96,7 @@ def make_litter_bin(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_wheelie_bin(rng: np.random.Generator) -> np.ndarray:
-    """A bin on two wheels, of 120 l or 1100 l."""
+    """Make a bin on wheels, of 120 l or 1100 l."""
     half, high = ((0.25, 0.24), 0.93) if rng.random() < 0.75 else ((0.55, 0.65), 1.3)
     x, y = half
     return parts([block((-x, -0.9 * y, 0.1), (x, 0.9 * y, high), reflectance=rng.uniform(0.1, 0.4)),
@@ -98,7 +105,7 @@ def make_wheelie_bin(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_bollard(rng: np.random.Generator) -> np.ndarray:
-    """A bollard of 0.6 to 1.1 m, some with a band that shines."""
+    """Make a bollard of 0.6 to 1.1 m, some with a retroreflective band."""
     high, radius = rng.uniform(0.6, 1.1), rng.uniform(0.05, 0.14)
     rows = [_cylinder(FOOT_M, high, radius, rng.uniform(0.1, 0.5)),
             part(ELLIPSOID, (0, 0, high), (radius, radius, 0.06), reflectance=0.3)]
@@ -108,9 +115,11 @@ def make_bollard(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_beacon(rng: np.random.Generator) -> np.ndarray:
-    """A post or board of 0.8 to 1.6 m, most of which shines, such as stands on islands and at
-    roadworks: narrower than a person, as high, and seen from far. Some have a base or a round
-    sign."""
+    """Make a mostly retroreflective post or board of 0.8 to 1.6 m, as on islands and at roadworks.
+
+    It is narrower than a person, about as high, and visible from far. Some have a base or a round
+    sign.
+    """
     high, low, half = rng.uniform((0.8, 0.05, 0.06), (1.6, 0.4, 0.3))
     if rng.random() < 0.5:
         rows = [_cylinder(FOOT_M, low, 0.8 * half, 0.3), _cylinder(low, high, half, PLATE)]
@@ -126,7 +135,7 @@ def make_beacon(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_cabinet(rng: np.random.Generator) -> np.ndarray:
-    """A cabinet of the telephone or the mains, 0.8 to 1.7 m high."""
+    """Make a telephone or power cabinet of 0.8 to 1.7 m."""
     x, y, high = rng.uniform((0.15, 0.2, 0.8), (0.3, 0.8, 1.7))
     return parts([block((-x, -y, FOOT_M), (x, y, high), reflectance=rng.uniform(0.2, 0.5)),
                   block((-x - 0.03, -y - 0.03, high), (x + 0.03, y + 0.03, high + 0.05),
@@ -134,7 +143,7 @@ def make_cabinet(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_bench(rng: np.random.Generator) -> np.ndarray:
-    """A bench with a back, which looks to +x; the seat is 0.45 m high."""
+    """Make a bench with a back, facing +x; the seat is 0.45 m high."""
     y = rng.uniform(0.7, 1.0)
     wood = dict(reflectance=rng.uniform(0.2, 0.4))
     rows = [block((-0.22, -y, 0.41), (0.25, y, 0.45), transmission=0.2, **wood),
@@ -147,7 +156,7 @@ def make_bench(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_shopping_trolley(rng: np.random.Generator) -> np.ndarray:
-    """A trolley of a supermarket, whose basket is of wire."""
+    """Make a shopping trolley with a wire basket."""
     rows = [block((-0.4, -0.28, 0.55), (0.45, 0.28, 1.0), reflectance=METAL,
                   density=rng.uniform(0.7, 1.2)),
             rod((-0.5, -0.27, 1.05), (-0.5, 0.27, 1.05), 0.02, reflectance=0.2),
@@ -160,7 +169,7 @@ def make_shopping_trolley(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_phone_box(rng: np.random.Generator) -> np.ndarray:
-    """Four posts, panes on three sides, a roof and the telephone."""
+    """Make a phone box: four posts, panes, a roof and the telephone."""
     half, high = 0.45, rng.uniform(2.2, 2.4)
     rows = [rod((sx * half, sy * half, FOOT_M), (sx * half, sy * half, high), 0.04,
                 reflectance=METAL) for sx in (-1, 1) for sy in (-1, 1)]
@@ -174,7 +183,7 @@ def make_phone_box(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_advertising_column(rng: np.random.Generator) -> np.ndarray:
-    """A round column with posters, 2.5 to 3.6 m high."""
+    """Make a round advertising column of 2.5 to 3.6 m."""
     high, radius = rng.uniform(2.5, 3.6), rng.uniform(0.5, 0.7)
     return parts([_cylinder(FOOT_M, high, radius, rng.uniform(0.3, 0.5)),
                   _cylinder(high, high + 0.15, radius + 0.08, 0.3),
@@ -183,7 +192,7 @@ def make_advertising_column(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_cone(rng: np.random.Generator) -> np.ndarray:
-    """A traffic cone of 0.5 to 0.75 m with a band that shines."""
+    """Make a traffic cone of 0.5 to 0.75 m with a retroreflective band."""
     high = rng.uniform(0.5, 0.75)
     return parts([block((-0.19, -0.19, 0), (0.19, 0.19, 0.03), reflectance=0.3),
                   _cylinder(0.03, 0.4 * high, 0.13, 0.4), _cylinder(0.4 * high, 0.7 * high, 0.09,
@@ -192,7 +201,7 @@ def make_cone(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_planter(rng: np.random.Generator) -> np.ndarray:
-    """A tub with a plant that is as high as a person."""
+    """Make a tub with a plant, together as high as a person."""
     high = rng.uniform(0.35, 0.6)
     tall = rng.uniform(0.35, 0.65)
     return parts([_cylinder(0.0, high, 0.32, rng.uniform(0.25, 0.45)),
@@ -201,7 +210,7 @@ def make_planter(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_parasol(rng: np.random.Generator) -> np.ndarray:
-    """A table of a cafe with two chairs under a parasol."""
+    """Make a cafe table with two chairs under a parasol."""
     high = rng.uniform(2.1, 2.5)
     rows = [rod((0, 0, 0), (0, 0, high), 0.025, reflectance=METAL),
             part(ELLIPSOID, (0, 0, high), (1.3, 1.3, 0.2), reflectance=0.35),
@@ -215,7 +224,7 @@ def make_parasol(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_hydrant(rng: np.random.Generator) -> np.ndarray:
-    """A pump, hydrant or parking meter: a post with a thicker head."""
+    """Make a pump, hydrant or parking meter: a post with a thicker head."""
     high = rng.uniform(0.9, 1.5)
     return parts([_cylinder(FOOT_M, high, rng.uniform(0.04, 0.12), 0.3),
                   part(ELLIPSOID, (0, 0, high - 0.15), (0.14, 0.17, 0.22),
@@ -223,7 +232,7 @@ def make_hydrant(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_stairs(rng: np.random.Generator, length: float) -> np.ndarray:
-    """Stairs along x, centred, that climb to +y from y = 0, with a landing behind and rails."""
+    """Make stairs along x, centred, up to +y from y = 0, with a landing and handrails."""
     x, count, rise = length / 2, int(rng.integers(2, 7)), rng.uniform(0.12, 0.17)
     end = 0.3 * count + rng.uniform(0.5, 2.0)
     rows = [block((-x, 0.3 * i, FOOT_M), (x, end, rise * (i + 1)), reflectance=0.4)
@@ -237,7 +246,7 @@ def make_stairs(rng: np.random.Generator, length: float) -> np.ndarray:
 
 
 def make_bicycle_stand(rng: np.random.Generator) -> np.ndarray:
-    """A hoop across x to which bicycles are locked."""
+    """Make a hoop that bicycles are locked to."""
     high = rng.uniform(0.7, 0.9)
     rows = [rod((s * 0.35, 0, FOOT_M), (s * 0.35, 0, high), 0.025, reflectance=METAL)
             for s in (-1, 1)]
@@ -253,7 +262,7 @@ def _cylinder(low: float, high: float, radius: float, reflectance: float) -> tup
                 reflectance=reflectance)
 
 
-# What a detector may take for a person.
+# Things that a detector may confuse with a person.
 PERSON_SIZED = (make_sign, make_beacon, make_litter_bin, make_wheelie_bin, make_bollard,
                 make_cabinet, make_shopping_trolley, make_phone_box, make_advertising_column,
                 make_cone, make_planter, make_parasol, make_hydrant, make_traffic_light, make_bench)

@@ -25,7 +25,7 @@ TRUCK, ON_RAILS, OTHER_VEHICLE = 18, 16, 20
 
 
 def make_truck(rng: np.random.Generator) -> Thing:
-    """A truck with a closed load, or with an open platform whose cab is its highest part."""
+    """Make a truck with a closed load, or with an open platform and a cab as highest part."""
     length, width, height = size = draw_size(rng, "Truck")
     open_load = rng.random() < 0.25
     top = rng.uniform(1.6, 2.2) if open_load else height
@@ -36,7 +36,7 @@ def make_truck(rng: np.random.Generator) -> Thing:
 
 def _truck_parts(length: float, width: float, load: float, cab: float, colour: float,
                  cargo: float) -> np.ndarray:
-    """load, cab: heights in metres of the load and the cab above the road."""
+    """Return the parts of a truck. load, cab: heights of load and cab above the road, m."""
     x, y, radius, floor = length / 2, width / 2, 0.48, 1.15
     back, belt, roof = x - min(2.2, 0.24 * length), 0.62 * cab, cab - 0.25
     shell, pane = Surface(reflectance=colour), Surface(reflectance=GLASS, transmission=0.75)
@@ -69,14 +69,14 @@ def _truck_parts(length: float, width: float, load: float, cab: float, colour: f
 
 
 def make_bus(rng: np.random.Generator) -> Thing:
-    """A city bus of 10.5 to 13 m."""
+    """Make a city bus of 10.5 to 13 m."""
     size = (rng.uniform(10.5, 13.0), rng.uniform(2.45, 2.55), rng.uniform(2.9, 3.2))
     made = _coach_parts(size, max(draw_paint(rng), 0.15), OTHER_VEHICLE, 0.5, (2.2 / size[0], 0.78))
     return make_rigid(made, size, "Misc")
 
 
 def make_tram(rng: np.random.Generator) -> Thing:
-    """A tram, or one section of it."""
+    """Make a tram, or one section of it."""
     size = draw_size(rng, "Tram")
     made = _coach_parts(size, max(draw_paint(rng), 0.15), ON_RAILS, 0.38, (0.18, 0.82))
     return make_rigid(made, size, "Tram")
@@ -84,8 +84,10 @@ def make_tram(rng: np.random.Generator) -> Thing:
 
 def _coach_parts(size: tuple[float, float, float], colour: float, semantic: int, radius: float,
                  axles: tuple[float, float]) -> np.ndarray:
-    """A long body with bands of windows, pillars between them and seats inside; axles: places as
-    shares of the length from the tail."""
+    """Return the parts of a long body with windows, pillars and seats.
+
+    axles: positions as shares of the length, from the tail.
+    """
     length, width, height = size
     x, y = length / 2, width / 2
     belt, top, floor = 0.38 * height, 0.82 * height, 0.45

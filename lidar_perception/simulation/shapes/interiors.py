@@ -1,5 +1,8 @@
-"""What is in a building. Walls are along x, centred, with their face at y = 0, which looks to -y,
-and the rest beyond it; what stands looks to +x. Each function returns (P,) PART."""
+"""Parts of interiors: pieces of walls, and furniture.
+
+Walls are along x, centred, with their face at y = 0 towards -y, and the rest behind it. Furniture
+faces +x. Each function returns (P,) PART.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,12 @@ from lidar_perception.simulation.shapes.furniture import BUILDING, FOOT_M, OTHER
 from lidar_perception.simulation.shapes.thing import GLASS, METAL, RUBBER, block, disc, rod
 from lidar_perception.simulation.solids import CYLINDER, part, parts
 
-DOOR_HEIGHT_M = 2.1   # m: height of a door
-WALL_THICKNESS_M = 0.2  # m: of walls
+DOOR_HEIGHT_M = 2.1
+WALL_THICKNESS_M = 0.2
 
 
 def make_wall(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
-    """A wall with a skirting, and now and then a rail, a board or a picture on it."""
+    """Make a wall with a skirting, some with a rail, a board or a picture."""
     x = length / 2
     rows = [_wall_panel((-x, x), FOOT_M, height, rng),
             block((-x, -0.015, 0.0), (x, 0.0, 0.1), reflectance=rng.uniform(0.1, 0.5))]
@@ -29,7 +32,7 @@ def make_wall(rng: np.random.Generator, length: float, height: float) -> np.ndar
 
 
 def make_door(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
-    """A door in its frame; one in three stands open, to a room."""
+    """Make a door in its frame; one in three is open to a room."""
     x, half = length / 2, min(0.5, 0.45 * length)
     rows = _opening_parts(rng, x, half, DOOR_HEIGHT_M, height)
     tone = rng.uniform(0.15, 0.6)
@@ -46,18 +49,18 @@ def make_door(rng: np.random.Generator, length: float, height: float) -> np.ndar
 
 
 def make_glazing(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
-    """Panes from the floor up between posts, and a room behind."""
+    """Make panes between posts from the floor up, with a room behind."""
     return parts([*_pane_parts(rng, length, min(height, rng.uniform(2.3, 3.0)), height),
                   *_room_parts(rng, length / 2, height)], BUILDING)
 
 
 def make_window(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
-    """Panes from the floor up between posts, with nothing behind."""
+    """Make panes between posts from the floor up, with nothing behind."""
     return parts(_pane_parts(rng, length, height - 0.3, height), BUILDING)
 
 
 def make_passage(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
-    """Where another corridor leaves."""
+    """Make the opening of another corridor."""
     x, far = length / 2, rng.uniform(6.0, 25.0)
     rows = [block((s * x, 0.0, FOOT_M), (s * (x + WALL_THICKNESS_M), far, height),
                   reflectance=rng.uniform(0.4, 0.7)) for s in (-1, 1)]
@@ -73,7 +76,7 @@ def _wall_panel(x: tuple, low: float, high: float, rng: np.random.Generator) -> 
 
 
 def _opening_parts(rng, x: float, half: float, top: float, height: float) -> list[tuple]:
-    """What is left of a wall around an opening."""
+    """Return the wall around an opening."""
     tone = dict(reflectance=rng.uniform(0.4, 0.75))
     return [block((-x, 0.0, FOOT_M), (-half, WALL_THICKNESS_M, height), **tone),
             block((half, 0.0, FOOT_M), (x, WALL_THICKNESS_M, height), **tone),
@@ -81,7 +84,7 @@ def _opening_parts(rng, x: float, half: float, top: float, height: float) -> lis
 
 
 def _room_parts(rng, x: float, height: float) -> list[tuple]:
-    """The walls of a room beyond, with something in it."""
+    """Return the walls of a room behind, with one thing in it."""
     far, tone = rng.uniform(2.5, 6.0), dict(reflectance=rng.uniform(0.4, 0.7))
     wide, deep, high = rng.uniform((0.3, 0.2, 0.7), (0.7, 0.5, 2.0))
     at = rng.uniform(-0.4, 0.4) * x
@@ -93,7 +96,7 @@ def _room_parts(rng, x: float, height: float) -> list[tuple]:
 
 
 def _pane_parts(rng, length: float, top: float, height: float) -> list[tuple]:
-    """A beam goes through the glass, or not; below is a rail, above the wall goes on."""
+    """Return panes that beams pass at random, with a rail below and wall above."""
     x, count = length / 2, max(round(length / rng.uniform(1.2, 2.0)), 1)
     rows = [block((-x, 0.06, 0.05), (x, 0.08, top), reflectance=GLASS,
                   transmission=rng.uniform(0.6, 0.9)),
@@ -107,7 +110,7 @@ def _pane_parts(rng, length: float, top: float, height: float) -> list[tuple]:
 
 def make_ceiling(rng: np.random.Generator, length: float, width: float,
                  height: float) -> np.ndarray:
-    """What is above, centred, so high; with lamps, or beams, below it."""
+    """Make a ceiling, centred, some with lamps or joists below it."""
     x, y = length / 2, width / 2
     rows = [block((-x, -y, height), (x, y, height + 0.3), reflectance=rng.uniform(0.4, 0.75))]
     count, deep = int(length / rng.uniform(3.0, 6.0)), rng.uniform(0.05, 0.4)
@@ -119,7 +122,7 @@ def make_ceiling(rng: np.random.Generator, length: float, width: float,
 
 
 def make_column(rng: np.random.Generator, height: float) -> np.ndarray:
-    """A round or a square column up to the ceiling."""
+    """Make a round or square column up to the ceiling."""
     half, tone = rng.uniform(0.12, 0.4), rng.uniform(0.3, 0.7)
     if rng.random() < 0.5:
         return parts([part(CYLINDER, (0, 0, height / 2), (half, half, height / 2),
@@ -128,7 +131,7 @@ def make_column(rng: np.random.Generator, height: float) -> np.ndarray:
 
 
 def make_shelf(rng: np.random.Generator, length: float) -> np.ndarray:
-    """A shelf along x, open to both sides, with what lies on its boards."""
+    """Make a shelf along x, open to both sides, with goods on its boards."""
     x, y, high = length / 2, rng.uniform(0.2, 0.35), rng.uniform(1.2, 2.2)
     levels = np.arange(0.1, high, rng.uniform(0.35, 0.5))
     rows = [block((s * x, -y, 0.0), (s * (x - 0.04), y, high), reflectance=METAL) for s in (-1, 1)]
@@ -141,7 +144,7 @@ def make_shelf(rng: np.random.Generator, length: float) -> np.ndarray:
 
 
 def make_table(rng: np.random.Generator, length: float, width: float) -> np.ndarray:
-    """A table, 0.7 to 0.78 m high, on four legs or a foot, at times with something on it."""
+    """Make a table of 0.7 to 0.78 m on four legs or a foot, some with a thing on it."""
     x, y, high = length / 2, width / 2, rng.uniform(0.7, 0.78)
     rows = [block((-x, -y, high - 0.04), (x, y, high), reflectance=rng.uniform(0.2, 0.6))]
     if rng.random() < 0.6:
@@ -158,14 +161,14 @@ def make_table(rng: np.random.Generator, length: float, width: float) -> np.ndar
 
 
 def make_chair(rng: np.random.Generator) -> np.ndarray:
-    """An empty chair."""
+    """Make an empty chair."""
     tone, back = dict(reflectance=rng.uniform(0.1, 0.5)), rng.uniform(0.8, 0.95)
     rows = [block((-0.2, -0.21, 0.42), (0.22, 0.21, 0.46), **tone),
             block((-0.22, -0.2, 0.5), (-0.19, 0.2, back), **tone)]
     if rng.random() < 0.7:
         rows += [rod((sx * 0.19, sy * 0.18, 0), (sx * 0.19, sy * 0.18, 0.44), 0.015,
                      reflectance=METAL) for sx in (-1, 1) for sy in (-1, 1)]
-    else:  # of an office, on castors
+    else:  # office chair on castors
         rows += [rod((0, 0, 0.06), (0, 0, 0.44), 0.03, reflectance=METAL),
                  part(CYLINDER, (0, 0, 0.06), (0.28, 0.28, 0.03), reflectance=RUBBER,
                       transmission=0.5)]
@@ -173,7 +176,7 @@ def make_chair(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_counter(rng: np.random.Generator) -> np.ndarray:
-    """A counter, which looks to +x."""
+    """Make a counter that faces +x."""
     y, high = rng.uniform(1.0, 2.5), rng.uniform(0.95, 1.2)
     return parts([block((-0.35, -y, 0.0), (0.3, y, high), reflectance=rng.uniform(0.2, 0.6)),
                   block((-0.4, -y - 0.05, high), (0.4, y + 0.05, high + 0.05), reflectance=0.4)],
@@ -181,7 +184,7 @@ def make_counter(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_display(rng: np.random.Generator) -> np.ndarray:
-    """A board on a foot, as wide and high as a person."""
+    """Make a display board on a foot, as wide and high as a person."""
     y, low, high = rng.uniform((0.2, 0.1, 1.5), (0.5, 0.9, 2.0))
     return parts([block((-0.03, -y, low), (0.03, y, high), reflectance=rng.uniform(0.1, 0.7)),
                   rod((0, 0, 0), (0, 0, high), 0.025, reflectance=METAL),
@@ -189,7 +192,7 @@ def make_display(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_machine(rng: np.random.Generator) -> np.ndarray:
-    """What sells drinks, or a wardrobe, or a locker."""
+    """Make a vending machine, wardrobe or locker."""
     x, y, high = rng.uniform((0.2, 0.25, 1.4), (0.45, 0.6, 2.0))
     return parts([block((-x, -y, 0.0), (x, y, high), reflectance=rng.uniform(0.1, 0.6)),
                   block((x, -0.8 * y, 0.7), (x + 0.01, 0.4 * y, high - 0.15), reflectance=GLASS)],
@@ -197,7 +200,7 @@ def make_machine(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_boxes(rng: np.random.Generator) -> np.ndarray:
-    """A pile of two to four boxes."""
+    """Make a pile of two to four boxes."""
     rows, z = [], 0.0
     for x, y, high, turn, tone in rng.random((rng.integers(2, 5), 5)).tolist():
         half, tall = (0.15 + 0.15 * x, 0.15 + 0.15 * y), 0.2 + 0.3 * high
@@ -208,7 +211,7 @@ def make_boxes(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_coat_stand(rng: np.random.Generator) -> np.ndarray:
-    """A post with what hangs on it."""
+    """Make a coat stand with coats."""
     high, wide, low = rng.uniform((1.6, 0.12, 0.5), (1.85, 0.25, 1.1))
     return parts([rod((0, 0, 0), (0, 0, high), 0.025, reflectance=METAL),
                   part(CYLINDER, (0, 0, 0.02), (0.22, 0.22, 0.02), reflectance=METAL),
@@ -218,7 +221,7 @@ def make_coat_stand(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_cart(rng: np.random.Generator) -> np.ndarray:
-    """A cart for cleaning, mail or trays."""
+    """Make a cart for cleaning, mail or trays."""
     x, y, high = rng.uniform((0.3, 0.22, 0.8), (0.5, 0.3, 1.5))
     rows = [block((-x, -y, z), (x, y, z + 0.04), reflectance=METAL)
             for z in np.linspace(0.2, high, 3)]
@@ -231,5 +234,5 @@ def make_cart(rng: np.random.Generator) -> np.ndarray:
     return parts(rows, OTHER)
 
 
-# What a detector may take for a person.
+# Things that a detector may confuse with a person.
 PERSON_SIZED = (make_display, make_machine, make_boxes, make_coat_stand, make_cart, make_chair)

@@ -1,4 +1,4 @@
-"""Pedestrians who walk or stand, with what they carry, and people who sit."""
+"""Pedestrians who walk or stand, the things they carry, and sitting people."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from lidar_perception.simulation.solids import BOX, ELLIPSOID, compute_hull, par
 PERSON, OTHER = 30, 99
 CARRIED = ("", "backpack", "bag", "umbrella", "trolley", "pram")
 
-STANCE = 0.54  # share of a stride for which a foot is on the ground; real walkers: 0.6
+STANCE = 0.54  # share of a stride with the foot on the ground; 0.6 for real walkers
 MIN_LENGTH_SHARE = 0.3  # shortest box as a share of the height, in KITTI
 HEEL_OFF = 0.6  # share of the stance after which the heel rises
 # Lengths as shares of the height, after Drillis and Contini (1966); radii with clothes.
@@ -36,9 +36,16 @@ HIP = REACH + ANKLE
 
 
 class PersonBuild(NamedTuple):
-    """A person. step: metres from one footfall to the next, 0 stands; phase: share of a stride at
-    the start; shift: metres that the hips are ahead of the origin; hair, coat, trousers:
-    reflectances; carried: one of CARRIED."""
+    """A person.
+
+    Attributes:
+        height, width: Metres.
+        step: Distance between footfalls in m, 0 for a standing person.
+        phase: Share of a stride at the start.
+        hair, coat, trousers: Reflectances.
+        carried: One of CARRIED.
+        shift: Distance of the hips ahead of the origin, m.
+    """
 
     height: float
     width: float
@@ -53,11 +60,11 @@ class PersonBuild(NamedTuple):
 
 def make_pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
                     carried: str = "") -> Thing:
-    """Someone who walks at speed m/s, or stands. The length of the box is what the body covers
-    over a whole stride, without a bag, umbrella, trolley or pram, but not below SHORTEST.
+    """Make a person who walks at speed (m/s), or stands.
 
-    Faster walkers take longer steps, too: the steps grow with the root of the speed (Sekiya et
-    al. 1996: length over rate is 0.0065 m min for all speeds).
+    The length of the box covers the body over a whole stride, without a bag, umbrella, trolley or
+    pram, and is at least MIN_LENGTH_SHARE of the height. Steps grow with the root of the speed
+    (Sekiya et al. 1996: length over rate is 0.0065 m min for all speeds).
     """
     _, width, height = draw_size(rng, CLASSES[PEDESTRIAN])
     if child:
@@ -74,7 +81,7 @@ def make_pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
 
 
 def _measure_stride(build: PersonBuild) -> tuple[float, float]:
-    """The least and largest x over a stride; both halves of it are alike."""
+    """Return the smallest and largest x over a stride, whose halves are symmetric."""
     body = build._replace(carried="backpack" if build.carried == "backpack" else "", phase=0.0)
     poses = [_limb_parts(i / 24, body) for i in range(12 if build.step else 1)]
     rows = [row for limbs, _ in poses for row in limbs] + _trunk_parts(body, 0.0)
@@ -83,9 +90,12 @@ def _measure_stride(build: PersonBuild) -> tuple[float, float]:
 
 
 def pose_walker(travelled: float, build: PersonBuild) -> np.ndarray:
-    """(P,) PART of a walker after so many metres; the last two rows before what is carried are the
-    feet, right and left. A foot on the ground stays where it is, and the hips sink as far as the
-    legs spread, so that the height is the box's when a leg is upright below the hips."""
+    """Return the parts (P,) PART of a walker after a distance in m.
+
+    The last two rows before the load are the feet, right and left. A foot on the ground does not
+    move, and the hips sink as the legs spread, so that the height is that of the box when a leg is
+    upright below the hips.
+    """
     turns = build.phase + (travelled / (2 * build.step) if build.step else 0.0)
     limbs, up = _limb_parts(turns, build)
     trunk = _trunk_parts(build, up)
@@ -95,7 +105,7 @@ def pose_walker(travelled: float, build: PersonBuild) -> np.ndarray:
 
 
 def _trunk_parts(build: PersonBuild, up: float) -> list[tuple]:
-    """Head, neck, chest and hips, and what is carried, so much higher than at rest."""
+    """Return head, neck, chest, hips and load, raised by `up` metres."""
     h, w = build.height, build.width
     return [
         part(ELLIPSOID, (0.012 * h, 0, 0.93 * h + up), (0.055 * h, 0.045 * h, 0.068 * h),
@@ -111,7 +121,7 @@ def _trunk_parts(build: PersonBuild, up: float) -> list[tuple]:
 
 
 def _limb_parts(turns: float, build: PersonBuild) -> tuple[list[tuple], float]:
-    """Arms, legs and feet after so many strides, and how much higher than at rest the hips are."""
+    """Return arms, legs and feet after a number of strides, and the rise of the hips in m."""
     h = build.height
     feet = [_pose_foot((turns + half) % 1.0, 2 * build.step, h) for half in (0.0, 0.5)]
     hip = min(HIP * h, *(z + sqrt((REACH * h) ** 2 - min(0.88 * abs(x), 0.9 * REACH * h) ** 2)
@@ -130,8 +140,10 @@ def _limb_parts(turns: float, build: PersonBuild) -> tuple[list[tuple], float]:
 
 
 def _pose_foot(u: float, stride: float, h: float) -> tuple[tuple, float, tuple]:
-    """The tip of the sole (x, z), the tilt of the foot (heel up) and the ankle (x, z) at share u
-    of a stride, in metres from the hips and the ground. It stands from u = 0 to STANCE."""
+    """Return tip of the sole (x, z), tilt of the foot (heel up) and ankle (x, z) at share u.
+
+    Positions are in m from the hips and the ground. The foot stands from u = 0 to STANCE.
+    """
     most = 0.6 * min(stride / (0.8 * h), 1.0)
     if u < STANCE:
         x = (STANCE / 2 - u) * stride
@@ -150,8 +162,7 @@ def _pose_foot(u: float, stride: float, h: float) -> tuple[tuple, float, tuple]:
 
 
 def _leg_parts(side: int, ankle: tuple, hip: float, h: float, trousers: float) -> list[tuple]:
-    """Thigh and shank; the knee bends forward as far as the ankle is near. The pelvis turns with
-    the legs."""
+    """Return thigh and shank. The knee bends forward; the pelvis turns with the legs."""
     start = (0.12 * ankle[0], hip)
     x, z = find_knee(start, ankle, THIGH * h, SHANK * h)
     y = side * 0.055 * h
@@ -160,7 +171,7 @@ def _leg_parts(side: int, ankle: tuple, hip: float, h: float, trousers: float) -
 
 
 def find_knee(hip: tuple, ankle: tuple, thigh: float, shank: float) -> tuple[float, float]:
-    """Where the knee is (x, z) between a hip and an ankle (x, z)."""
+    """Return the position of the knee (x, z) between a hip and an ankle (x, z)."""
     x, z = ankle[0] - hip[0], ankle[1] - hip[1]
     far = hypot(x, z)
     x, z = x / far, z / far
@@ -171,11 +182,13 @@ def find_knee(hip: tuple, ankle: tuple, thigh: float, shank: float) -> tuple[flo
 
 
 def _arm_parts(side: int, u: float, build: PersonBuild, up: float, left: bool) -> list[tuple]:
-    """Upper arm and forearm, which swings with the other leg, or holds what is carried. The
-    forearm reaches the width of the box."""
+    """Return upper arm and forearm, which swing with the other leg or hold the load.
+
+    The forearm is at the width of the box.
+    """
     h, w, coat = build.height, build.width, build.coat
     swing = 0.45 * min(build.step / (0.43 * h), 1.2) * cos(2 * pi * u)
-    bend = 0.3 if build.step else build.phase  # who stands holds the arms in many ways
+    bend = 0.3 if build.step else build.phase  # standing people hold their arms in many ways
     if build.carried == "pram" or (build.carried == "umbrella" and left):
         swing, bend = 0.2, (1.1 if build.carried == "pram" else 2.2)
     elif build.carried == "trolley" and not left:
@@ -191,7 +204,7 @@ def _arm_parts(side: int, u: float, build: PersonBuild, up: float, left: bool) -
 
 
 def _load_parts(carried: str, h: float, w: float, up: float, coat: float) -> list[tuple]:
-    """What somebody carries, pulls or pushes; bag and trolley on the right."""
+    """Return the load that is carried, pulled or pushed; bag and trolley are on the right."""
     if carried == "backpack":
         return [part(ELLIPSOID, (-0.1 * h, 0, 0.7 * h + up), (0.07 * h, 0.085 * h, 0.13 * h),
                      reflectance=0.5 * coat)]
@@ -224,8 +237,10 @@ def _load_parts(carried: str, h: float, w: float, up: float, coat: float) -> lis
 
 
 def make_sitting_person(rng: np.random.Generator, chair: bool = True) -> Thing:
-    """Someone who sits, knees and feet ahead; without a chair they need a bench below them, whose
-    seat is 0.45 m high. The box holds the person and the chair."""
+    """Make a sitting person with knees and feet ahead; the box includes the chair.
+
+    Without a chair they need a bench with a seat at 0.45 m.
+    """
     length, width, height = size = draw_size(rng, "Person_sitting")
     coat, trousers = rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75)
     front, back, seat = length / 2, -length / 2, 0.45

@@ -1,4 +1,4 @@
-"""What a labelled thing is, how large such things are, and rods, discs and boxes to build with."""
+"""Labelled things, their sizes, and primitives to build them: rods, discs, blocks and panes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RUBBER, METAL, SKIN, GLASS, PLATE = 0.06, 0.3, 0.4, 0.04, RETROREFLECTOR
 # Length, width, height in metres: mean and standard deviation, and the correlation of length and
 # height, over the labels of 57 frames of KITTI's object training set and the tracks of 30 frames
 # of tracking sequence 0000 (207 cars, 18 vans, 5 trucks, 4 trams, 15 pedestrians, 13 cyclists).
-# They hold no sitting person: the mean is the whole training set's, the spread a guess.
+# They contain no sitting person: its mean is that of the whole training set, its spread a guess.
 SIZES = {
     "Car": ((3.88, 1.62, 1.51), (0.47, 0.11, 0.11), 0.0),
     "Van": ((4.68, 1.83, 1.96), (0.59, 0.16, 0.19), 0.8),
@@ -29,9 +29,14 @@ SIZES = {
 
 
 class Thing(NamedTuple):
-    """A thing that KITTI labels. parts: metres travelled -> (P,) PART. size: length, width, height
-    in metres of the box that annotators draw, one for all poses, centred at (0, 0, height / 2).
-    label: one of CLASSES. What a person pushes, and mirrors, may reach out of the box."""
+    """A thing that KITTI labels. Mirrors, and things that a person pushes, may exceed its box.
+
+    Attributes:
+        parts: parts(metres travelled) -> (P,) PART.
+        size: Length, width, height in m of the annotated box, the same for all poses, centred at
+            (0, 0, height / 2).
+        label: One of CLASSES.
+    """
 
     parts: Callable[[float], np.ndarray]
     size: tuple[float, float, float]
@@ -39,7 +44,7 @@ class Thing(NamedTuple):
 
 
 def make_rigid(made: np.ndarray, size: tuple[float, float, float], label: str) -> Thing:
-    """A thing whose parts are the same wherever it is."""
+    """Return a thing whose parts do not change."""
     return Thing(partial(_return_parts, made), size, label)
 
 
@@ -48,8 +53,8 @@ def _return_parts(made: np.ndarray, travelled: float) -> np.ndarray:
 
 
 def draw_size(rng: np.random.Generator, label: str) -> tuple[float, float, float]:
-    """A length, width and height in metres as KITTI's boxes of the class have them, within two
-    standard deviations."""
+    """Draw length, width and height in m like those of KITTI's boxes, within 2 standard deviations.
+    """
     mean, spread, together = SIZES[label]
     z = rng.normal(size=3)
     z[2] = together * z[0] + np.sqrt(1 - together ** 2) * z[2]
@@ -58,13 +63,15 @@ def draw_size(rng: np.random.Generator, label: str) -> tuple[float, float, float
 
 
 def interpolate(share: float, low: float, high: float) -> float:
-    """What rng.uniform(low, high) gives where rng.random() gives share: many numbers drawn at once
-    take a tenth of the time."""
+    """Return low + share * (high - low), as rng.uniform for a number drawn by rng.random.
+
+    Drawing many numbers at once takes a tenth of the time.
+    """
     return low + (high - low) * share
 
 
 def rod(start: tuple, end: tuple, radius: float, **surface) -> tuple:
-    """A cylinder from start to end (x, y, z)."""
+    """Return a cylinder from start to end (x, y, z)."""
     x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     level = hypot(x, y)
     return part(CYLINDER, _midpoint(start, end), (radius, radius, hypot(level, z) / 2),
@@ -72,13 +79,13 @@ def rod(start: tuple, end: tuple, radius: float, **surface) -> tuple:
 
 
 def disc(centre: tuple, radius: float, half_width: float, **surface) -> tuple:
-    """A cylinder whose axis lies along y: a wheel."""
+    """Return a cylinder along y, such as a wheel."""
     return part(CYLINDER, centre, (radius, radius, half_width), pitch=pi / 2, yaw=pi / 2,
                 **surface)
 
 
 def block(corner: tuple, opposite: tuple, **surface) -> tuple:
-    """An upright box between two corners (x, y, z)."""
+    """Return an upright box between two corners (x, y, z)."""
     (a, b, c), (x, y, z) = corner, opposite
     return part(BOX, _midpoint(corner, opposite), (abs(x - a) / 2, abs(y - b) / 2, abs(z - c) / 2),
                 **surface)
@@ -90,7 +97,7 @@ def _midpoint(one: tuple, other: tuple) -> tuple:
 
 def slope(front: tuple, back: tuple, half_width: float, thickness: float = 0.01,
           **surface) -> tuple:
-    """A thin board across y from front (x, z) to back (x, z), such as a windscreen."""
+    """Return a thin board across y from front (x, z) to back (x, z), such as a windscreen."""
     (x0, z0), (x1, z1) = front, back
     return part(BOX, ((x0 + x1) / 2, 0.0, (z0 + z1) / 2),
                 (hypot(x0 - x1, z0 - z1) / 2, half_width, thickness / 2),
@@ -98,8 +105,10 @@ def slope(front: tuple, back: tuple, half_width: float, thickness: float = 0.01,
 
 
 def upright_pane(x: tuple, low: tuple, high: tuple, thickness: float = 0.01, **surface) -> tuple:
-    """A thin board along x from x[0] to x[1] whose edges are at low (y, z) and high (y, z): the
-    side window of a cabin that gets narrower upwards."""
+    """Return a thin board from x[0] to x[1] with edges at low (y, z) and high (y, z).
+
+    Such as the side window of a cabin that is narrower at the top.
+    """
     (y0, z0), (y1, z1) = low, high
     return part(BOX, ((x[0] + x[1]) / 2, (y0 + y1) / 2, (z0 + z1) / 2),
                 (thickness / 2, (x[1] - x[0]) / 2, hypot(y1 - y0, z1 - z0) / 2), yaw=pi / 2,

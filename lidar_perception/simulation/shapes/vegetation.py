@@ -1,4 +1,4 @@
-"""Trees, bushes and hedges: crowns that let some beams through."""
+"""Trees, bushes and hedges, whose leaves some beams pass."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ WOOD = {"reflectance": BARK, "semantic": TRUNK}
 
 
 def make_tree(rng: np.random.Generator, height: float | None = None) -> np.ndarray:
-    """(P,) PART of a broad-leaved tree so many metres high, drawn if not given: a trunk, three
-    boughs, a crown and three tufts, none below a third of the height. Its foot is 0.3 m in the
-    ground."""
+    """Make a broad-leaved tree (P,) PART: trunk, boughs, a crown and three smaller balls of leaves.
+
+    No leaves are below a third of the height, which is drawn if not given. The trunk begins 0.3 m
+    below the ground.
+    """
     height = rng.uniform(4.0, 11.0) if height is None else height
     fork, radius = height * rng.uniform(0.33, 0.42), height * rng.uniform(0.016, 0.026)
     top = (*rng.uniform(-0.03, 0.03, 2) * height, 0.75 * height)
@@ -40,7 +42,7 @@ def make_tree(rng: np.random.Generator, height: float | None = None) -> np.ndarr
 
 
 def make_conifer(rng: np.random.Generator) -> np.ndarray:
-    """(P,) PART of a conifer with boughs down to the ground."""
+    """Make a conifer (P,) PART with boughs down to the ground."""
     height = rng.uniform(2.5, 9.0)
     stem = rod((0, 0, -0.3), (0, 0, 0.8 * height), 0.015 * height, **WOOD)
     tall = 0.2 * height
@@ -51,7 +53,7 @@ def make_conifer(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_bush(rng: np.random.Generator) -> np.ndarray:
-    """(P,) PART of a bush, 0.6 to 2 m high: three overlapping balls of leaves."""
+    """Make a bush (P,) PART of 0.6 to 2 m: three overlapping balls of leaves."""
     high = rng.uniform(0.3, 1.0)
     rows = []
     for x, y, a, b, c, *rest in rng.random((3, 8)).tolist():
@@ -63,8 +65,7 @@ def make_bush(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_hedge(rng: np.random.Generator, length: float) -> np.ndarray:
-    """(P,) PART of a hedge so long along x, centred, with an uneven top; its foot is 0.3 m in the
-    ground."""
+    """Make a hedge (P,) PART along x, centred, with an uneven top, from 0.3 m below the ground."""
     height, half = rng.uniform(0.8, 2.0), rng.uniform(0.25, 0.5)
     rows = [part(BOX, (0, 0, height / 2 - 0.15), (length / 2, half, height / 2 + 0.15),
                  reflectance=LEAVES, density=rng.uniform(4, 10))]
@@ -78,7 +79,7 @@ def _draw_foliage(rng: np.random.Generator, centre: tuple, half: tuple, density:
 
 
 def _leaf_ball(drawn: list[float], centre: tuple, half: tuple, density: tuple) -> tuple:
-    """A ball of leaves; drawn: three numbers 0 .. 1 for its yaw, reflectance and density."""
+    """Return a ball of leaves; drawn: numbers 0 .. 1 for its yaw, reflectance and density."""
     turn, tone, thick = drawn
     return part(ELLIPSOID, centre, half, yaw=turn * pi,
                 reflectance=LEAVES * interpolate(tone, 0.8, 1.25),

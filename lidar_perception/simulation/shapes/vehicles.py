@@ -1,4 +1,4 @@
-"""Cars and vans: a hollow body with wheels in arches, and a cabin of panes with seats inside."""
+"""Cars and vans: a hollow body with wheels in arches, and a glazed cabin with seats."""
 
 from __future__ import annotations
 
@@ -25,32 +25,39 @@ from lidar_perception.simulation.solids import CYLINDER, ELLIPSOID, Surface, par
 
 CAR = 10
 PILLAR = 0.035   # radius, m
-LIGHTS = 0.9
-# Only the middle of a bumper is where a car ends. On KITTI's cars seen from the front, points of
-# the middle third are 0.06 m behind the end of the box at 0.25 to 0.35 of the height, 0.2 m at
-# 0.45, 0.33 m at 0.52 and 0.84 m at 0.62; 0.43 of the width beside the middle, 0.3 m more (medians
-# of 25 to 38 cars up to 40 m away). Tails are upright: 0.06 m in the middle third up to 0.7 of the
-# height; round at their corners: 0.15 m at 0.86 of the half width, 0.4 m at 0.96. Sides are 0.04 m
-# inside of the box: that is as wide as the mirrors, or is drawn so.
-BUMPER = 0.29    # of the height: there a car ends
-BONNET = 0.13    # m: so far behind the end is a bonnet's edge in the middle
-CORNER = 0.3     # m: and at its sides
-TAIL = 0.07      # m: so far before its end a tail is flat
-TAIL_FLAT, TAIL_SIDE = 0.59, 0.95  # of the half width: so far, and from there to here it is round
-TAIL_ROUND = 0.45  # m: lengthwise
-TAIL_LOW, TAIL_TOP = 0.22, 0.67  # of the height: between these a tail is closed
-SIDE = 0.035     # m: so far inside of its box a body is
-DOME = 0.09      # m: so much higher is a roof in its middle
+LIGHTS = 0.9     # reflectance
+# Only the middle of a bumper reaches the end of the box. On KITTI's cars seen from the front,
+# points of the middle third are 0.06 m behind the end of the box at 0.25 to 0.35 of the height,
+# 0.2 m at 0.45, 0.33 m at 0.52 and 0.84 m at 0.62; points 0.43 of the width from the middle are
+# 0.3 m further behind (medians of 25 to 38 cars up to 40 m away). Tails are upright: 0.06 m in the
+# middle third up to 0.7 of the height; round at their corners: 0.15 m at 0.86 of the half width,
+# 0.4 m at 0.96. Sides are 0.04 m inside the box, which may be as wide as the mirrors.
+BUMPER = 0.29    # height of the foremost point, as a share of the height
+BONNET = 0.13    # m from the front of the box to the middle of the bonnet's edge,
+CORNER = 0.3     # m and to the sides of the edge
+TAIL = 0.07      # m from the rear of the box to the flat part of the tail
+TAIL_FLAT, TAIL_SIDE = 0.59, 0.95  # ends of the flat and the round part, of the half width
+TAIL_ROUND = 0.45  # m: length of the round part
+TAIL_LOW, TAIL_TOP = 0.22, 0.67  # ends of the closed part of the tail, of the height
+SIDE = 0.035     # m from the side of the box to the body
+DOME = 0.09      # m: rise of the roof in its middle
 MOTTLE = 0.7     # standard deviation of the logarithm of the reflectance of parts of one body
-LEGS = 0.5       # m: from a bench to the front seats, at least
+LEGS = 0.5       # m: smallest distance from a bench to the front seats
 
 
 class Style(NamedTuple):
-    """The outline of a body from the side. Places along the body are shares of its length from
-    the tail (0) to the nose (1): where the windscreen ends at the bonnet and at the roof, where
-    the roof ends behind and the rear window below. bonnet and belt: heights of the bonnet and of
-    the lower edge of the windows as shares of the height. load: from the tail up to here the body
-    is closed up to the roof, as a panel van's."""
+    """Outline of a body from the side.
+
+    Positions along the body are shares of its length from the tail (0) to the nose (1).
+
+    Attributes:
+        screen_low, screen_high: Windscreen at the bonnet and at the roof.
+        roof_rear: Rear end of the roof.
+        rear_low: Lower end of the rear window.
+        bonnet, belt: Heights of the bonnet and the lower edge of the windows, as shares of the
+            height.
+        load: The body is closed up to the roof from the tail to here, as a panel van's.
+    """
 
     screen_low: float
     screen_high: float
@@ -70,7 +77,7 @@ PANEL_VAN = Style(0.85, 0.70, 0.03, 0.01, 0.52, 0.56, 0.55)
 
 
 def make_car(rng: np.random.Generator, driver: bool = True) -> Thing:
-    """A car of random size, body and paint. driver: whether someone sits in it."""
+    """Make a car of random size, body and paint."""
     size = draw_size(rng, CLASSES[CAR_ID])
     if size[2] > 1.62:
         style = SUV
@@ -83,7 +90,7 @@ def make_car(rng: np.random.Generator, driver: bool = True) -> Thing:
 
 
 def make_van(rng: np.random.Generator, driver: bool = True) -> Thing:
-    """A minibus or a panel van of random size and paint."""
+    """Make a minibus or panel van of random size and paint."""
     size = draw_size(rng, "Van")
     style = PANEL_VAN if rng.random() < 0.6 else MINIBUS
     coat = max(draw_paint(rng), draw_paint(rng))
@@ -92,15 +99,20 @@ def make_van(rng: np.random.Generator, driver: bool = True) -> Thing:
 
 
 def draw_paint(rng: np.random.Generator) -> float:
-    """The reflectance of a coat of paint. Half of all points on KITTI's cars are below 0.03 and a
-    tenth is above 0.4: dark paint throws the beam away. Yet dark cars are seen at 40 m."""
+    """Draw the reflectance of a coat of paint.
+
+    Half of all points on KITTI's cars are below 0.03 and a tenth is above 0.4, since dark paint
+    reflects beams away. Yet dark cars are seen at 40 m.
+    """
     dark, middle, light = (0.02, 0.05), (0.04, 0.35), (0.25, 0.6)
     return float(rng.uniform(*(dark, middle, light)[rng.choice(3, p=(0.5, 0.25, 0.25))]))
 
 
 def _vary_reflectance(solids: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The same with parts brighter and darker than others, as lacquer on KITTI's cars is. Nothing
-    is drawn from rng itself: streets stay as they are, whatever their cars are made of."""
+    """Vary the reflectance of the parts, as on KITTI's cars.
+
+    Nothing is drawn from rng itself, so that streets do not depend on the materials of their cars.
+    """
     factor = rng.spawn(1)[0].lognormal(0.0, MOTTLE, len(solids))
     dull = solids["reflectance"] < PLATE
     solids["reflectance"][dull] = np.minimum(solids["reflectance"] * factor, 0.95)[dull]
@@ -109,9 +121,17 @@ def _vary_reflectance(solids: np.ndarray, rng: np.random.Generator) -> np.ndarra
 
 def make_body(size: tuple[float, float, float], style: Style, colour: float, glass: float,
               driver: bool = True) -> np.ndarray:
-    """(P,) PART. size: length, width, height in metres, without the mirrors; colour: reflectance;
-    glass: share of the beams that pass a pane. Below the belt are door panels, boxes over the
-    axles and a floor with sills between the wheels."""
+    """Make a body (P,) PART.
+
+    Below the belt are door panels, boxes over the axles and a floor with sills between the wheels.
+
+    Args:
+        size: Length, width, height in m, without the mirrors.
+        style: Outline.
+        colour: Reflectance.
+        glass: Share of the beams that pass a pane.
+        driver: A person sits in the car.
+    """
     length, width, height = size
     x, y = length / 2, width / 2 - SIDE
     radius = min(0.205 * height, 0.34)
@@ -169,13 +189,13 @@ def make_body(size: tuple[float, float, float], style: Style, colour: float, gla
 
 
 def _bumper_part(x: float, y: float, height: float, surface: Surface) -> tuple:
-    """What reaches x in its middle, rounded seen from above and from the side."""
+    """Return a bumper that reaches x in its middle, rounded from above and from the side."""
     return part(ELLIPSOID, (x - copysign(0.5, x), 0.0, BUMPER * height), (0.5, y, 0.17 * height),
                 **surface)
 
 
 def _corner_parts(x: float, y: float, heights: tuple, surface: Surface) -> list[tuple]:
-    """The two corners of a tail at x, round seen from above, between two heights."""
+    """Return the two corners of a tail at x, round from above, between two heights."""
     low, high = heights
     return [part(CYLINDER, (x + TAIL_ROUND, side * TAIL_FLAT * y, (low + high) / 2),
                  (TAIL_ROUND, (TAIL_SIDE - TAIL_FLAT) * y, (high - low) / 2), **surface)
@@ -183,8 +203,10 @@ def _corner_parts(x: float, y: float, heights: tuple, surface: Surface) -> list[
 
 
 def _bonnet_parts(foot: tuple, x: float, y: float, height: float, surface: Surface) -> list[tuple]:
-    """A bonnet and its crown, from the foot (x, z) of the windscreen down to the nose at x. At its
-    edge is a step of 0.2 m down; the crown is 0.04 of the height above the foot."""
+    """Return a bonnet and its crown, from the foot (x, z) of the windscreen to the nose at x.
+
+    Its edge has a step of 0.2 m; the crown is 0.04 of the height above the foot.
+    """
     low, top = foot
     return [slope((x - CORNER, 0.44 * height - 0.08), (low, top - 0.08), y, 0.2, **surface),
             part(ELLIPSOID, (low, 0.0, 0.4 * height), (x - BONNET - low, y, top - 0.36 * height),
@@ -193,9 +215,11 @@ def _bonnet_parts(foot: tuple, x: float, y: float, height: float, surface: Surfa
 
 def _seat_parts(x: float, rear: float, y: float, low: float, high: float,
                 driver: bool) -> list[tuple]:
-    """Backs of the front seats at x, of the bench ahead of rear if there is room, the driver.
-    Most beams end on none of them: what comes back through two panes is weak. On KITTI's cars seen
-    from behind, 2 % of the points are where the bench is, with these 1 to 2 %."""
+    """Return the backs of the front seats at x, of the bench if there is room, and the driver.
+
+    Most beams end on none of them, since returns through two panes are weak. On KITTI's cars seen
+    from behind, 2 % of the points are at the bench; with these 1 to 2 %.
+    """
     cloth = Surface(reflectance=0.02, transmission=0.75)
     rows = [block((x - 0.08, -y, low), (x + 0.04, y, high), **cloth)]
     if x - rear > LEGS:

@@ -12,7 +12,7 @@ SPOKE_TRANSMISSION = 0.6  # share of the beams that pass between the spokes
 
 
 def make_wheelchair(rng: np.random.Generator) -> Thing:
-    """Someone in a wheelchair, who may move; a Person_sitting, whose box holds the chair."""
+    """Make a person in a wheelchair: a Person_sitting whose box includes the chair."""
     person = make_sitting_person(rng, chair=False)
     (length, width, height), radius = person.size, rng.uniform(0.28, 0.32)
     y, back = width / 2 - 0.03, -length / 2 + 0.3
