@@ -25,7 +25,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.testing.bags import copy_bag
-from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.types import GroundTruth, InputError
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.compression import decompress
@@ -130,7 +130,7 @@ def test_zstd_chunks_hold_several_clouds(tmp_path):
     ("none", bytes)])
 def test_bag_is_compressed_as_asked(tmp_path, compression, pack):
     cloud = np.random.default_rng(0).normal(size=(2000, 4)).astype(np.float32)
-    data = encode(cloud_message(cloud))
+    data = encode(make_cloud_message(cloud))
     with BagWriter(tmp_path / "bag", compression=compression) as bag:
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
         for i in range(3):
