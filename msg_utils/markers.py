@@ -13,7 +13,7 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,52 +51,85 @@ class MarkedObjects:
         return len(self.boxes)
 
 
+class MarkerRow(NamedTuple):
+    """Content of a marker that differs between the markers of an array.
+
+    quaternion: (z, w) of the rotation about z. scale: x, y, z. points: (N, 3) metres.
+    """
+
+    ns: str
+    id: int
+    action: int = ADD
+    type: int = CUBE
+    text: str = ""
+    position: Sequence[float] = (0.0, 0.0, 0.0)
+    quaternion: tuple[float, float] = (0.0, 1.0)
+    scale: Sequence[float] = (0.0, 0.0, 0.0)
+    color: tuple[float, float, float, float] = (*OTHER_COLOR, 0.4)
+    points: np.ndarray | None = None
+
+
+def make_marker_rows(boxes: np.ndarray, labels: Sequence[str],
+                     scores: Sequence[float] | np.ndarray | None = None, *,
+                     ids: Sequence[int] | np.ndarray | None = None,
+                     extras: Sequence[dict[str, Any]] | None = None,
+                     notes: Iterable[tuple[str, dict[str, Any]]] = (),
+                     previous: Iterable[tuple[str, int]] = (),
+                     color: tuple[float, float, float] | None = None) -> list[MarkerRow]:
+    """Return the markers of K boxes; for the arguments see to_marker_array."""
+    rows, shown = [], set()
+    numbers = np.asarray(boxes, np.float64).reshape(-1, 7).tolist()
+    ids = range(len(numbers)) if ids is None else ids
+    for i, (box, label, number) in enumerate(zip(numbers, labels, map(int, ids), strict=True)):
+        content = dict(extras[i]) if extras is not None else {}
+        if scores is not None:
+            content["score"] = float(scores[i])
+        half = box[6] / 2
+        rows.append(MarkerRow(label, number, ADD, CUBE, json.dumps(content) if content else "",
+                              box[:3], (math.sin(half), math.cos(half)), box[3:6],
+                              (*(color or COLORS.get(label, OTHER_COLOR)), 0.4)))
+        shown.add((label, number))
+    rows += [MarkerRow(label, -1 - i, DELETE, text=json.dumps(content))
+             for i, (label, content) in enumerate(notes)]
+    rows += [MarkerRow(label, number, DELETE) for label, number in sorted(set(previous) - shown)]
+    return rows or [MarkerRow("", 0, DELETE)]
+
+
 def to_marker_array(boxes: np.ndarray, labels: Sequence[str],
                     scores: Sequence[float] | np.ndarray | None = None, *, header: Any, make: Any,
-                    ids: Sequence[int] | np.ndarray | None = None,
-                    extras: Sequence[dict[str, Any]] | None = None,
-                    notes: Iterable[tuple[str, dict[str, Any]]] = (),
-                    previous: Iterable[tuple[str, int]] = (),
-                    color: tuple[float, float, float] | None = None,
-                    lifetime_ns: int = 0) -> Any:
+                    lifetime_ns: int = 0, **more: Any) -> Any:
     """Build a MarkerArray of K boxes.
 
     Args:
         ids: K ids, by default 0..K-1.
+        extras: K dicts for the texts.
+        notes: (label, content) of objects without a 3D box.
         previous: list_marker_keys() of the previous array.
         color: (r, g, b) in place of the labels' colours.
         lifetime_ns: 0 for no limit.
     """
-    boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
-    ids = range(len(boxes)) if ids is None else ids
-    lifetime = make_duration(lifetime_ns, make)
-    empty = make_box_pose(np.zeros(7), make)  # with a unit quaternion
+    return rows_to_message(make_marker_rows(boxes, labels, scores, **more), header, make,
+                           lifetime_ns)
 
-    def marker(ns: str, index: int, action: int, text: str, pose: Any = empty,
-               scale: Iterable[float] = (0, 0, 0),
-               rgb: tuple[float, float, float] = OTHER_COLOR) -> Any:
-        x, y, z = map(float, scale)
-        r, g, b = rgb
-        return make("visualization_msgs/msg/Marker", header=header, ns=ns, id=int(index),
-                    type=CUBE, action=action, pose=pose, lifetime=lifetime, text=text,
-                    scale=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-                    color=make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=0.4))
 
-    markers, shown = [], set()
-    for i, (box, label, index) in enumerate(zip(boxes, labels, ids, strict=True)):
-        content = dict(extras[i]) if extras is not None else {}
-        if scores is not None:
-            content["score"] = float(scores[i])
-        markers.append(marker(label, index, ADD, json.dumps(content) if content else "",
-                              make_box_pose(box, make), box[3:6],
-                              color or COLORS.get(label, OTHER_COLOR)))
-        shown.add((label, int(index)))
-    for i, (label, content) in enumerate(notes):
-        markers.append(marker(label, -1 - i, DELETE, json.dumps(content)))
-    for label, index in sorted(set(previous) - shown):
-        markers.append(marker(label, index, DELETE, ""))
-    if not markers:
-        markers.append(marker("", 0, DELETE, ""))
+def rows_to_message(rows: Iterable[MarkerRow], header: Any, make: Any, lifetime_ns: int = 0) -> Any:
+    """Build a MarkerArray of rows."""
+    def vector(kind: str, numbers: Sequence[float]) -> Any:
+        x, y, z = map(float, numbers)
+        return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+
+    lifetime, markers = make_duration(lifetime_ns, make), []
+    for row in rows:
+        (z, w), (r, g, b, a) = row.quaternion, row.color
+        turn = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
+        points = [] if row.points is None else [vector("Point", point) for point in row.points]
+        markers.append(make(
+            "visualization_msgs/msg/Marker", header=header, ns=row.ns, id=row.id, type=row.type,
+            action=row.action, lifetime=lifetime, text=row.text, points=points,
+            pose=make("geometry_msgs/msg/Pose", position=vector("Point", row.position),
+                      orientation=turn),
+            scale=vector("Vector3", row.scale),
+            color=make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a)))
     return make("visualization_msgs/msg/MarkerArray", markers=markers)
 
 
@@ -123,9 +156,13 @@ def find_header(msg: Any) -> Any | None:
     return None if found is None else found.header
 
 
-def list_marker_keys(msg: Any) -> frozenset[tuple[str, int]]:
-    """Return (ns, id) of the markers that an array shows, to be `previous` of the next array."""
-    return frozenset((m.ns, int(m.id)) for m in msg.markers if m.action == ADD)
+def list_marker_keys(array: Any) -> frozenset[tuple[str, int]]:
+    """Return (ns, id) of the markers that an array shows, to be `previous` of the next array.
+
+    array: a MarkerArray, or its rows.
+    """
+    return frozenset((m.ns, int(m.id)) for m in getattr(array, "markers", array)
+                     if m.action == ADD)
 
 
 def make_box_pose(box: np.ndarray, make: Any) -> Any:

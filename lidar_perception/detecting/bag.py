@@ -12,13 +12,12 @@ from lidar_perception.data.frame import return_none
 from lidar_perception.data.to_bag import DETECTIONS_3D, MARKERS, FrameWriter
 from lidar_perception.detecting.formats import Run
 from lidar_perception.detecting.results import FrameResult
-from lidar_perception.types import CLASSES, Detections, InputError, PointCloud
-from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import make_detection_markers
+from lidar_perception.types import Detections, InputError, PointCloud
+from lidar_perception.wire.array_codec import encode_detection_array, encode_markers
+from lidar_perception.wire.messages import make_detection_rows
 from lidar_perception.wire.topics import FOUND, TRACKS
-from lidar_perception.wire.track_markers import make_track_markers
-from msg_utils.detections import to_detection_array
-from msg_utils.markers import list_marker_keys
+from lidar_perception.wire.track_markers import make_track_rows
+from msg_utils.markers import MarkerRow, list_marker_keys
 
 
 class Bag:
@@ -61,23 +60,22 @@ class Bag:
                 self.run.skipped.append(f"not in {self.path}: {error}")
                 return
         header, stamp_ns = content.header, content.stamp_ns
-        self._write(self.found, stamp_ns, make_detection_markers(
-            result.detections, header, bag_message, self._shown.get(self.found, ())))
+        self._write(self.found, stamp_ns, header, make_detection_rows(
+            result.detections, self._shown.get(self.found, ())))
         self._write_3d(self.found, stamp_ns, header, result.detections)
         if self.tracks is not None and (tracks := result.tracks) is not None:
-            self._write(self.tracks, stamp_ns, make_track_markers(
+            self._write(self.tracks, stamp_ns, header, make_track_rows(
                 tracks.ids, tracks.detections, tracks.velocities, tracks.moving, result.trails,
-                header, bag_message, previous=self._shown.get(self.tracks, ())))
+                previous=self._shown.get(self.tracks, ())))
             self._write_3d(self.tracks, stamp_ns, header, tracks.detections, ids=tracks.ids,
                            covariances=tracks.pose_covariances())
         self.writer.write(content)
 
-    def _write(self, topic: str, stamp_ns: int, markers: Any) -> None:
-        self._shown[topic] = list_marker_keys(markers)
-        self.bag.write(topic, stamp_ns, markers)
+    def _write(self, topic: str, stamp_ns: int, header: Any, rows: list[MarkerRow]) -> None:
+        self._shown[topic] = list_marker_keys(rows)
+        self.bag.write(topic, stamp_ns, encode_markers(rows, header))
 
     def _write_3d(self, topic: str, stamp_ns: int, header: Any, found: Detections,
                   **more: Any) -> None:
-        self.bag.write(f"{topic}_3d", stamp_ns, to_detection_array(
-            found.boxes, [CLASSES[i] for i in found.class_ids], found.scores, header=header,
-            make=bag_message, **more))
+        self.bag.write(f"{topic}_3d", stamp_ns, encode_detection_array(
+            found.boxes, found.labels, found.scores, header=header, **more))

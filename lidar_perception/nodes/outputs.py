@@ -21,11 +21,11 @@ from lidar_perception.nodes.track_outputs import (
 )
 from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
+from lidar_perception.wire.array_codec import encode_detection_array, encode_markers
 from lidar_perception.wire.codec import bag_message, encode
-from lidar_perception.wire.messages import make_detection_markers, make_xyz_cloud
-from msg_utils.detections import to_detection_array
-from msg_utils.markers import list_marker_keys, to_marker_array
-from msg_utils.messages import load_message_class, make_ros_message
+from lidar_perception.wire.messages import make_detection_rows, make_xyz_cloud
+from msg_utils.markers import list_marker_keys, make_marker_rows
+from msg_utils.messages import load_message_class
 from msg_utils.stamps import make_header, to_ns
 
 
@@ -53,12 +53,10 @@ class ClusterBoxes:
         if self.publisher.get_subscription_count():
             header, output = to_output_frame(self.node, header, boxes())
             ids = range(1, len(output) + 1)  # as in the column cluster_id
-            markers = to_marker_array(output, ["cluster"] * len(output), header=header,
-                                      make=bag_message, ids=ids, previous=self.marker_keys,
-                                      lifetime_ns=find_marker_lifetime_ns(self.node),
-                                      extras=_marker_texts(output, ids))
-            self.marker_keys = list_marker_keys(markers)
-            self.publisher.publish(encode(markers))
+            rows = make_marker_rows(output, ["cluster"] * len(output), ids=ids,
+                                    previous=self.marker_keys, extras=_marker_texts(output, ids))
+            self.marker_keys = list_marker_keys(rows)
+            self.publisher.publish(encode_markers(rows, header, find_marker_lifetime_ns(self.node)))
 
 
 def _marker_texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
@@ -106,10 +104,9 @@ class DetectionMarkers:
     def publish(self, header: Any, detections: Detections,
                 clusters: np.ndarray | None = None) -> None:
         """Publish detections that are in the frame of the header."""
-        message = make_detection_markers(detections, header, bag_message, self.marker_keys,
-                                         find_marker_lifetime_ns(self.node), clusters)
-        self.marker_keys = list_marker_keys(message)
-        self.publisher.publish(encode(message))
+        rows = make_detection_rows(detections, self.marker_keys, clusters)
+        self.marker_keys = list_marker_keys(rows)
+        self.publisher.publish(encode_markers(rows, header, find_marker_lifetime_ns(self.node)))
 
 
 class DetectionOutputs:
@@ -149,10 +146,8 @@ class DetectionOutputs:
         detections = replace(detections, boxes=boxes)
         self.markers.publish(header, detections, clusters)
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
-            self.detections_3d.publish(to_detection_array(
-                detections.boxes, [CLASSES[i] for i in detections.class_ids], detections.scores,
-                make=make_ros_message,
-                header=make_header(to_ns(header.stamp), header.frame_id, make_ros_message)))
+            self.detections_3d.publish(encode_detection_array(
+                detections.boxes, detections.labels, detections.scores, header=header))
         for step, publisher in self.step_times.items():
             if step in ms:
                 publisher.publish(Float64(data=ms[step]))

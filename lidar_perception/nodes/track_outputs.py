@@ -16,13 +16,12 @@ from lidar_perception.tracking.ego import NO_SOURCE
 from lidar_perception.tracking.state import Tracks
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
-from lidar_perception.types import CLASSES, Detections
-from lidar_perception.wire.codec import bag_message, encode
-from lidar_perception.wire.track_markers import make_track_markers
-from msg_utils.detections import to_detection_array
+from lidar_perception.types import Detections
+from lidar_perception.wire.array_codec import encode_detection_array, encode_markers
+from lidar_perception.wire.track_markers import make_track_rows
 from msg_utils.markers import list_marker_keys
-from msg_utils.messages import load_message_class, make_ros_message
-from msg_utils.stamps import SECOND_NS, make_header, to_ns
+from msg_utils.messages import load_message_class
+from msg_utils.stamps import SECOND_NS, to_ns
 
 DETECTIONS_3D = "vision_msgs/msg/Detection3DArray"
 MIN_LIFETIME_PERIODS = 2.5  # lifetime of markers in periods of the input
@@ -92,19 +91,18 @@ class TrackOutputs:
     def _send(self, header: Any, stamp: int, tracks: Tracks) -> None:
         output = self.node.node_params.output
         trails = self.trails(tracks, self.tracker.pose, stamp, output.trail)
-        message = make_track_markers(
-            tracks.ids, tracks.detections, tracks.velocities, tracks.moving, trails, header,
-            bag_message, previous=self.marker_keys, lifetime_ns=find_marker_lifetime_ns(self.node),
-            extras=[{"seen": bool(seen), "age": round(float(age), 3)}
-                    for seen, age in zip(tracks.seen, tracks.ages)])
-        self.marker_keys = list_marker_keys(message)
-        self.markers.publish(encode(message))
+        rows = make_track_rows(
+            tracks.ids, tracks.detections, tracks.velocities, tracks.moving, trails,
+            previous=self.marker_keys, extras=[
+                {"seen": bool(seen), "age": round(float(age), 3)}
+                for seen, age in zip(tracks.seen, tracks.ages)])
+        self.marker_keys = list_marker_keys(rows)
+        self.markers.publish(encode_markers(rows, header, find_marker_lifetime_ns(self.node)))
         if self.array is not None and self.array.get_subscription_count():
             detections = tracks.detections
-            self.array.publish(to_detection_array(
-                detections.boxes, [CLASSES[i] for i in detections.class_ids], detections.scores,
-                ids=tracks.ids, covariances=tracks.pose_covariances(), make=make_ros_message,
-                header=make_header(stamp, header.frame_id, make_ros_message)))
+            self.array.publish(encode_detection_array(
+                detections.boxes, detections.labels, detections.scores, header=header,
+                ids=tracks.ids, covariances=tracks.pose_covariances()))
 
     def _count(self, stamp: int, reported: int) -> None:
         tracker, now = self.tracker, stamp / 1e9

@@ -29,7 +29,13 @@ from lidar_perception.types import (
     usable_returns,
 )
 from lidar_perception.wire.topics import CAMERA_FRAME
-from msg_utils.markers import MarkedObjects, to_marker_array
+from msg_utils.markers import (
+    MarkedObjects,
+    MarkerRow,
+    make_marker_rows,
+    rows_to_message,
+    to_marker_array,
+)
 from msg_utils.point_cloud2 import CloudError, from_array, read_columns, read_xyz, to_array
 from msg_utils.stamps import to_ns
 
@@ -282,15 +288,15 @@ def to_detections(objects: MarkedObjects) -> Detections:
                          objects.scores)
 
 
-def make_detection_markers(detections: Detections, header: Any, make: Any, previous: Any = (),
-                           lifetime_ns: int = 0, clusters: np.ndarray | None = None) -> Any:
-    """Make the MarkerArray of K detections.
+def make_detection_rows(detections: Detections, previous: Any = (),
+                        clusters: np.ndarray | None = None) -> list[MarkerRow]:
+    """Return the markers of K detections.
 
     The text of each marker is JSON with the id, the probability given by each of its sources, and
     the `cluster_id`. The cluster id is there because a marker id has 32 bits only.
 
     Args:
-        previous, lifetime_ns: as in to_marker_array.
+        previous: as in to_marker_array.
         clusters: (K,) ids in the column `cluster_id` of the cloud, if each detection is one
             cluster.
     """
@@ -302,8 +308,15 @@ def make_detection_markers(detections: Detections, header: Any, make: Any, previ
                                in detections.sources.items() if np.isfinite(scores[i])}
     for text, cluster in zip(texts, () if clusters is None else clusters):
         text["cluster_id"] = int(cluster)
-    return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,
-                           extras=texts, previous=previous, lifetime_ns=lifetime_ns)
+    return make_marker_rows(detections.boxes, labels, detections.scores, extras=texts,
+                            previous=previous)
+
+
+def make_detection_markers(detections: Detections, header: Any, make: Any, previous: Any = (),
+                           lifetime_ns: int = 0, clusters: np.ndarray | None = None) -> Any:
+    """Make the MarkerArray of K detections; for the arguments see make_detection_rows."""
+    return rows_to_message(make_detection_rows(detections, previous, clusters), header, make,
+                           lifetime_ns)
 
 
 def make_odometry(pose: np.ndarray, header: Any, moving_frame: str, make: Any) -> Any:
