@@ -17,8 +17,8 @@ from lidar_perception.detectors.params import MIN_SCORE, ScoreParams
 from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
-from lidar_perception.tracking.drive_tracker import ego_of
-from lidar_perception.tracking.ego import recorded_poses
+from lidar_perception.tracking.drive_tracker import choose_ego_source
+from lidar_perception.tracking.ego import make_pose_reader
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections, GroundTruth
@@ -48,12 +48,12 @@ def measure_recording(recording: Recording) -> dict:
     detector = open_detector("pointpillars", min_score=MIN_SCORE,
                              sensor_height=recording.frames[0].sensor_height)
     drives: dict[str, list[Seen]] = {}
-    source = ego_of(recording)
+    source = choose_ego_source(recording)
     for frame in show_progress(recording, "detecting", len(recording)):
         truth, frame = frame.truth(), frame.with_cached_scan()
         if truth is not None and all("track_id" in extra for extra in truth.extras):
             if frame.sequence not in drives:
-                pose_of = recorded_poses(source)
+                pose_of = make_pose_reader(source)
             drives.setdefault(frame.sequence, []).append(
                 Seen(detector(frame.load()).detections, truth, frame.stamp_ns, pose_of(frame),
                      frame.calibration()))

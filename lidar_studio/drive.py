@@ -19,7 +19,7 @@ from lidar_perception.candidates.pipeline import segment_cloud
 from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.param_fields import with_values
-from lidar_perception.tracking.ego import usable
+from lidar_perception.tracking.ego import is_valid_pose
 from lidar_perception.types import InputError, PointCloud, did_you_mean
 from lidar_studio.interpolation import Motion
 from lidar_studio.journal import header
@@ -150,7 +150,7 @@ class Drive:
         """Times, and poses where every frame has one."""
         stamps = np.array([frame.stamp_ns for frame in self.frames], np.int64)
         poses = [frame.pose() for frame in self.frames]
-        if not poses or not all(map(usable, poses)):
+        if not poses or not all(map(is_valid_pose, poses)):
             return Motion.of(stamps)
         return Motion.of(stamps, np.array(poses, np.float64))
 

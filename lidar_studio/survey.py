@@ -22,7 +22,7 @@ from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.groups import group_points
 from lidar_perception.runs.processes import run_in_processes
-from lidar_perception.tracking.ego import Odometry, recorded_source
+from lidar_perception.tracking.ego import Odometry, choose_recorded_source
 from lidar_perception.types import Detections
 from lidar_studio.drive import Drive, one_drive, settings
 
@@ -114,7 +114,7 @@ def surveyed(drive: Drive, choice: DetectorChoice | None, here: bool = False,
 
 
 def _by_scans(drive: Drive) -> bool:
-    return recorded_source(drive.motion.poses is not None) == "kiss_icp"
+    return choose_recorded_source(drive.motion.poses is not None) == "kiss_icp"
 
 
 def _here(drive: Drive, choice: DetectorChoice | None,

@@ -109,7 +109,7 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
     from lidar_perception.detecting.run import header_of
     from lidar_perception.detectors.open import doubts
     from lidar_perception.rendering.files import check_film
-    from lidar_perception.tracking.drive_tracker import ego_of
+    from lidar_perception.tracking.drive_tracker import choose_ego_source
 
     if dask and jobs > 1:
         raise click.UsageError("--jobs is for this machine, --dask for others: give one of them")
@@ -132,7 +132,7 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
     opened_detector = open_()
     header = header_of(recording, detector.weights, opened_detector,
                        tracking=tracking if track else None,
-                       ego=ego_of(recording, ego) if track else None,
+                       ego=choose_ego_source(recording, ego) if track else None,
                        split=None if split is None else str(split), device=detector.device)
     if track and min_score is None:  # the tracker is given weak ones too
         open_ = partial(detector.open, sensor_height=height, min_score=tracking.min_score)

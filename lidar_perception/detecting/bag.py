@@ -68,7 +68,7 @@ class Bag:
                 tracks.ids, tracks.detections, tracks.velocities, tracks.moving, result.trails,
                 previous=self._shown.get(self.tracks, ())))
             self._write_3d(self.tracks, stamp_ns, header, tracks.detections, ids=tracks.ids,
-                           covariances=tracks.pose_covariances())
+                           covariances=tracks.to_pose_covariances())
         self.writer.write(content)
 
     def _write(self, topic: str, stamp_ns: int, header: Any, rows: list[MarkerRow]) -> None:

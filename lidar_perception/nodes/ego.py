@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lidar_perception.nodes.runtime import CLOUD, JUMP_NS, LidarNode
 from lidar_perception.robot.transform_tree import MissingTransform, TransformTree
-from lidar_perception.tracking.ego import NO_SOURCE, Odometry, best_source, has_odometry
+from lidar_perception.tracking.ego import NO_SOURCE, Odometry, choose_source, has_odometry
 from lidar_perception.tracking.params import EgoParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import to_point_cloud
@@ -37,7 +37,7 @@ class EgoInput:
             find_pose(). Otherwise KISS-ICP subscribes to ~/input/points.
 
     Attributes:
-        source: present source of the poses, see best_source.
+        source: present source of the poses, see choose_source.
         is_mounting_known: the pose of the sensor in the child frame of the odometry is available.
     """
 
@@ -143,10 +143,10 @@ class EgoInput:
             available.add("odometry")
         if self.scan_ns:
             available.add("kiss_icp")
-        if best_source(wanted, {"tf", *available}) == "tf" != self.source and (
+        if choose_source(wanted, {"tf", *available}) == "tf" != self.source and (
                 self._connected(frame_id, stamp)):
             available.add("tf")
-        self.source, self.is_mounting_known = best_source(wanted, available), True
+        self.source, self.is_mounting_known = choose_source(wanted, available), True
         if self.source == "odometry":
             self.is_mounting_known = self.transforms.knows_motion_of(frame_id)
             if not self.is_mounting_known:

@@ -75,7 +75,7 @@ class TrackOutputs:
         problem = sensor_problem or self.ego.find_problem(header.frame_id, stamp)
         tracker.params = self.params().tracking
         tracks = tracker(detections, stamp, pose)
-        if tracker.taken:
+        if tracker.frame_used:
             self._send(header, stamp, tracks)
         self._count(stamp, len(tracks))
         return tracker.problem or problem
@@ -102,20 +102,20 @@ class TrackOutputs:
             detections = tracks.detections
             self.array.publish(encode_detection_array(
                 detections.boxes, detections.labels, detections.scores, header=header,
-                ids=tracks.ids, covariances=tracks.pose_covariances()))
+                ids=tracks.ids, covariances=tracks.to_pose_covariances()))
 
     def _count(self, stamp: int, reported: int) -> None:
         tracker, now = self.tracker, stamp / 1e9
         if self.count_history and not 0 <= now - self.count_history[-1][0] <= RATE_WINDOW_S:
             self.count_history.clear()  # time jumped, or there are no stamps
-        self.count_history.append((now, tracker.born, tracker.ended))
+        self.count_history.append((now, tracker.started, tracker.ended))
         while now - self.count_history[0][0] > RATE_WINDOW_S or len(self.count_history) > 1000:
             self.count_history.popleft()
         before, born, ended = self.count_history[0]
         self.node.counts.update(ego=self.ego.source, tracks=reported, alive=tracker.alive,
-                                born=tracker.born, ended=tracker.ended)
+                                born=tracker.started, ended=tracker.ended)
         if now > before:
-            self.node.counts["born_per_s"] = f"{(tracker.born - born) / (now - before):.2f}"
+            self.node.counts["born_per_s"] = f"{(tracker.started - born) / (now - before):.2f}"
             self.node.counts["ended_per_s"] = f"{(tracker.ended - ended) / (now - before):.2f}"
 
 

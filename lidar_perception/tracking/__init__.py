@@ -1,1 +1,1 @@
-"""Tracks: ids, velocities and steadier detections over time, also on a moving robot."""
+"""Multi-object tracking: ids, velocities and steadier detections, also on a moving robot."""

@@ -1,4 +1,4 @@
-"""Tracks of a whole recording, drive by drive, with the poses that it has."""
+"""Tracker for a whole recording, drive by drive, with the poses of the recording."""
 
 from __future__ import annotations
 
@@ -8,69 +8,79 @@ from lidar_perception.data.drives import is_same_drive
 from lidar_perception.data.frame import POSES, Frame, Recording
 from lidar_perception.tracking.ego import (
     NO_SOURCE,
+    choose_recorded_source,
     has_odometry,
-    recorded_poses,
-    recorded_source,
-    usable,
+    is_valid_pose,
+    make_pose_reader,
 )
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.state import Tracks
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections, InputError
 
-LOOKED_AT = 50  # frames, the first ones, whether one of them has a pose
+MAX_POSE_CHECKS = 50  # frames at the start of a recording that are searched for a pose
 
 
 class DriveTracker:
-    """Track the detections of a recording: tracker(frame, detections) -> Tracks.
+    """Tracker for the detections of a recording: tracker(frame, detections) -> Tracks.
 
-    Call it for each frame in order of time. All tracks end where another drive begins: with
-    another sequence, or in a recording without sequences, such as a bag, where the stamps jump (see
-    data.drives). Ids go on, so no two tracks of a recording share one. ego, one of RECORDED_EGO,
-    says where poses come from, see ego_of; kiss_icp loads every frame.
+    Call it for each frame in order of time. All tracks end where a new drive begins: at a new
+    sequence, or, in a recording without sequences such as a bag, where the stamps jump (see
+    data.drives). Ids are unique in the whole recording.
 
-    After each call drive names the drive of the frame, and posed says whether its pose was known,
-    or none was wanted.
+    Args:
+        ego: source of the poses, one of RECORDED_EGO; see choose_ego_source. kiss_icp loads every
+            frame.
+
+    Attributes:
+        drive: name of the drive of the last frame.
+        has_pose: True if the last frame had a pose, or if ego is "none".
     """
 
     def __init__(self, recording: Recording, params: TrackingParams = TrackingParams(),
                  ego: str = "auto") -> None:
-        self.ego = ego_of(recording, ego)
-        self.tracker, self.pose_of = Tracker(params), recorded_poses(self.ego)
-        self.drive, self.posed = "", True
-        self._last = "", -1  # sequence and stamp of the frame before
+        self.ego = choose_ego_source(recording, ego)
+        self.tracker, self._read_pose = Tracker(params), make_pose_reader(self.ego)
+        self.drive, self.has_pose = "", True
+        self._last = "", -1  # sequence and stamp of the previous frame
         self._number = 0     # of the drive
 
     def __call__(self, frame: Frame, detections: Detections) -> Tracks:
-        """The tracks of the frame after these detections, in its LiDAR frame. InputError where its
-        pose cannot be read."""
+        """Return the tracks after a frame, in its LiDAR frame.
+
+        Raises InputError if the pose of the frame cannot be read.
+        """
         sequence, stamp_ns = self._last
         if frame.sequence != sequence or not (
                 frame.sequence or is_same_drive(stamp_ns, frame.stamp_ns)):
             self.tracker.reset()
-            self.pose_of = recorded_poses(self.ego)
+            self._read_pose = make_pose_reader(self.ego)
             self._number += 1
         self._last = frame.sequence, frame.stamp_ns
         self.drive = frame.sequence or f"drive {self._number}"
-        pose = self.pose_of(frame)
-        self.posed = pose is not None or self.ego == NO_SOURCE
+        pose = self._read_pose(frame)
+        self.has_pose = pose is not None or self.ego == NO_SOURCE
         return self.tracker(detections, frame.stamp_ns, pose)
 
 
-def ego_of(recording: Recording, wanted: str = "auto") -> str:
-    """Where the sensor's motion comes from, of RECORDED_EGO all but auto, which is: the poses of
-    the recording, where one of its first LOOKED_AT frames has one, else KISS-ICP, where that is
-    installed, else those poses that there are, else none."""
+def choose_ego_source(recording: Recording, wanted: str = "auto") -> str:
+    """Resolve "auto" to the source of the sensor's motion; return any other source as given.
+
+    "auto" is the first of: the recording's poses if one of its first MAX_POSE_CHECKS frames has
+    one, KISS-ICP if it is installed, the recording's poses if it has any, none.
+    """
     if wanted != "auto":
         return wanted
-    return recorded_source(POSES in recording.has and (
-        not has_odometry() or any(map(has_pose, islice(recording.frames, LOOKED_AT)))))
+    return choose_recorded_source(POSES in recording.has and (
+        not has_odometry() or any(map(has_valid_pose, islice(recording.frames, MAX_POSE_CHECKS)))))
 
 
-def has_pose(frame: Frame) -> bool:
-    """Return True if a frame has a pose that can be used: odometry with another clock than the
-    clouds' gives none."""
+def has_valid_pose(frame: Frame) -> bool:
+    """Return True if a frame has a valid pose.
+
+    A recording whose odometry and clouds have different clocks has none.
+    """
     try:
-        return usable(frame.pose())
-    except InputError:  # said where the frame is measured
+        return is_valid_pose(frame.pose())
+    except InputError:  # reported when the frame is scored
         return False

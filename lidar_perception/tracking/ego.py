@@ -1,7 +1,7 @@
-"""The sensor's own motion: boxes into a fixed frame and back, and poses where some are missing.
+"""Motion of the sensor: sources of poses, validity, and extrapolation where poses are missing.
 
-A pose (4, 4) float64 is the sensor's frame in a fixed one. Without poses the fixed frame is the
-sensor's own, and velocities are relative to it.
+A pose is a (4, 4) float64 matrix from the sensor's frame to a fixed frame. Without poses the fixed
+frame is the sensor's own, and velocities are relative to the sensor.
 """
 
 from __future__ import annotations
@@ -16,88 +16,105 @@ from scipy.spatial.transform import Rotation
 from lidar_perception.data.frame import Frame
 from lidar_perception.types import InputError
 
-MAX_SPEED = 100.0   # m/s; a sensor that seems faster was put somewhere else
-NOT_RIGID = 1e-2    # how far a pose's rotation may be from one
-SOURCES = ("recording", "odometry", "tf", "kiss_icp")  # of poses, the best first
+MAX_SPEED = 100.0   # m/s; a faster pose change is a jump
+MAX_ROTATION_ERROR = 1e-2  # largest element of R R^T - I in a valid pose
+SOURCES = ("recording", "odometry", "tf", "kiss_icp")  # of poses, best first
 NO_SOURCE = "none"
-MAPPED, FINE = 0.5, 1.5  # of a voxel of the map: one point in each goes there, is registered
-COARSE, ENOUGH = 3.0, 300
-CONVERGED = 1e-3    # m and rad, the step of KISS-ICP that is its last
+# Cell sizes of KISS-ICP's downsampling, in map voxels, and the points needed to register coarsely
+MAP_CELL, FINE_CELL, COARSE_CELL = 0.5, 1.5, 3.0
+MIN_COARSE_POINTS = 300
+CONVERGENCE = 1e-3  # m and rad; KISS-ICP stops at a smaller step
 
 
 @dataclass(frozen=True)
 class Ego:
-    """pose (4, 4); velocity (3,) m/s in the sensor's frame and rotation (3,) rad/s, as a vector,
-    as of the last two poses that were given; missing: seconds since the last one; known: whether
-    there ever was one."""
+    """Motion state of the sensor.
+
+    Attributes:
+        pose: (4, 4) current pose, extrapolated where poses are missing.
+        velocity: (3,) m/s in the sensor's frame, from the last two given poses.
+        rotation: (3,) rotation vector, rad/s, from the last two given poses.
+        missing_s: seconds since the last given pose.
+        has_pose: True once a pose was given.
+    """
 
     pose: np.ndarray
     velocity: np.ndarray
     rotation: np.ndarray
-    missing: float = 0.0
-    known: bool = False
+    missing_s: float = 0.0
+    has_pose: bool = False
 
     @staticmethod
     def unknown() -> Ego:
-        """Before any pose."""
+        """Return the state before the first pose."""
         return Ego(np.eye(4), np.zeros(3), np.zeros(3))
 
 
-def usable(pose: np.ndarray | None) -> bool:
-    """Whether this is a pose: rigid, and all of it finite."""
+def is_valid_pose(pose: np.ndarray | None) -> bool:
+    """Return True for a finite, rigid (4, 4) pose."""
     if pose is None or np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
         return False
     rotation = np.asarray(pose, float)[:3, :3]
-    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < NOT_RIGID
+    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < MAX_ROTATION_ERROR
                 and np.linalg.det(rotation) > 0)
 
 
-def next_ego(ego: Ego, pose: np.ndarray | None, seconds: float, max_gap: float) -> Ego:
-    """The sensor `seconds` after ego; pose None where it is missing: then it moves on as before,
-    for max_gap seconds."""
+def advance_ego(ego: Ego, pose: np.ndarray | None, seconds: float, max_gap: float) -> Ego:
+    """Return the motion state `seconds` later.
+
+    Where the pose is missing (None), the sensor keeps its velocity for max_gap seconds and then
+    stands still.
+    """
     if pose is not None:
         pose = np.asarray(pose, np.float64)
-        since = seconds + ego.missing
-        if not ego.known or since <= 0:
+        since = seconds + ego.missing_s
+        if not ego.has_pose or since <= 0:
             return Ego(pose, ego.velocity, ego.rotation, 0.0, True)
-        start = ego.pose @ np.linalg.inv(_moved(ego, min(ego.missing, max_gap)))
+        start = ego.pose @ np.linalg.inv(_compute_step(ego, min(ego.missing_s, max_gap)))
         step = np.linalg.inv(start) @ pose
         return Ego(pose, step[:3, 3] / since,
                    Rotation.from_matrix(step[:3, :3]).as_rotvec() / since, 0.0, True)
-    on = max(min(seconds, max_gap - ego.missing), 0.0)
-    return Ego(ego.pose @ _moved(ego, on), ego.velocity, ego.rotation, ego.missing + seconds,
-               ego.known)
+    moving_s = max(min(seconds, max_gap - ego.missing_s), 0.0)
+    return Ego(ego.pose @ _compute_step(ego, moving_s), ego.velocity, ego.rotation,
+               ego.missing_s + seconds, ego.has_pose)
 
 
-def _moved(ego: Ego, seconds: float) -> np.ndarray:
+def _compute_step(ego: Ego, seconds: float) -> np.ndarray:
     step = np.eye(4)
     step[:3, :3] = Rotation.from_rotvec(ego.rotation * seconds).as_matrix()
     step[:3, 3] = ego.velocity * seconds
     return step
 
 
-def jumped(ego: Ego, pose: np.ndarray, seconds: float) -> bool:
-    """Whether a pose is so far from the last one that no sensor drives there in so many seconds."""
-    apart = np.linalg.norm(np.asarray(pose, float)[:3, 3] - ego.pose[:3, 3])
-    return ego.known and bool(apart > MAX_SPEED * (seconds + ego.missing) + 1.0)
+def is_jump(ego: Ego, pose: np.ndarray, seconds: float) -> bool:
+    """Return True if no sensor can reach a pose from the last one in this time."""
+    distance = np.linalg.norm(np.asarray(pose, float)[:3, 3] - ego.pose[:3, 3])
+    return ego.has_pose and bool(distance > MAX_SPEED * (seconds + ego.missing_s) + 1.0)
 
 
-def best_source(wanted: str, there: Collection[str]) -> str:
-    """Whence the sensor's motion is known: of the SOURCES that are there the wanted one, and with
-    "auto" the best; NO_SOURCE where there is no such."""
-    return next((name for name in SOURCES if name in there and wanted in ("auto", name)),
+def choose_source(wanted: str, available: Collection[str]) -> str:
+    """Choose a source of poses: the wanted one, or with "auto" the best of those available.
+
+    Returns NO_SOURCE if the wanted source is not available.
+    """
+    return next((name for name in SOURCES if name in available and wanted in ("auto", name)),
                 NO_SOURCE)
 
 
-def recorded_source(poses: bool, wanted: str = "auto") -> str:
-    """best_source of recorded frames, which have poses or not. One that is wanted by name is taken
-    to be there, as it says itself where it is not."""
-    return best_source(wanted, {wanted, *["recording"] * poses, *["kiss_icp"] * has_odometry()})
+def choose_recorded_source(has_poses: bool, wanted: str = "auto") -> str:
+    """Choose the source of poses for recorded frames, which may have poses of their own.
+
+    A source other than "auto" is assumed to be available; it reports itself if it is not.
+    """
+    return choose_source(
+        wanted, {wanted, *["recording"] * has_poses, *["kiss_icp"] * has_odometry()})
 
 
-def recorded_poses(source: str) -> Callable[[Frame], np.ndarray | None]:
-    """pose_of(frame) -> pose (4, 4) or None, for the frames of one drive in their order; source as
-    of recorded_source. InputError where KISS-ICP, which loads each frame, is not installed."""
+def make_pose_reader(source: str) -> Callable[[Frame], np.ndarray | None]:
+    """Make a function frame -> pose (4, 4) or None, for the frames of one drive in order.
+
+    KISS-ICP loads each frame. Raises InputError if source is kiss_icp and it is not installed.
+    """
     if source == "kiss_icp":
         odometry = Odometry()
         return lambda frame: odometry(frame.load().xyz)
@@ -105,16 +122,17 @@ def recorded_poses(source: str) -> Callable[[Frame], np.ndarray | None]:
 
 
 def has_odometry() -> bool:
-    """Whether Odometry can be made: the extra [odometry] is installed."""
+    """Return True if the extra [odometry], which Odometry needs, is installed."""
     return importlib.util.find_spec("kiss_icp") is not None
 
 
 class Odometry:
-    """odometry(xyz (N, 3)) -> pose (4, 4) of the scan in the frame of the first, by KISS-ICP
-    (Vizzo et al., RA-L 2023). InputError where it is not installed.
+    """KISS-ICP odometry (Vizzo et al., RA-L 2023): odometry(xyz) -> pose.
 
-    It runs in one thread, so that the same scans give the same poses, and registers one point in
-    each COARSE voxels, where that leaves ENOUGH.
+    It runs in one thread, so that equal scans give equal poses. Scans are registered at the coarse
+    resolution if that leaves MIN_COARSE_POINTS, else at the fine one.
+
+    Raises InputError if kiss-icp is not installed.
     """
 
     def __init__(self, voxel: float = 1.0) -> None:
@@ -123,23 +141,25 @@ class Odometry:
             from kiss_icp.kiss_icp import KissICP
             from kiss_icp.voxelization import voxel_down_sample
         except ImportError:
-            raise InputError("ego motion from the scans needs kiss-icp; pip install "
+            raise InputError("ego motion from scans needs kiss-icp; run pip install "
                              "'lidar_perception[odometry]'") from None
         config = KISSConfig()
         config.mapping.voxel_size, config.data.deskew = voxel, False
         config.registration.max_num_threads = 1
-        config.registration.convergence_criterion = CONVERGED
+        config.registration.convergence_criterion = CONVERGENCE
 
         def voxelize(scan: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            """What is registered, and what goes into the map."""
-            mapped = voxel_down_sample(scan, MAPPED * voxel)
-            few = voxel_down_sample(mapped, COARSE * voxel)
-            return few if len(few) >= ENOUGH else voxel_down_sample(mapped, FINE * voxel), mapped
+            # points to register, and points for the map
+            mapped = voxel_down_sample(scan, MAP_CELL * voxel)
+            coarse = voxel_down_sample(mapped, COARSE_CELL * voxel)
+            if len(coarse) >= MIN_COARSE_POINTS:
+                return coarse, mapped
+            return voxel_down_sample(mapped, FINE_CELL * voxel), mapped
 
         self._icp = KissICP(config)
         self._icp.voxelize = voxelize
 
     def __call__(self, xyz: np.ndarray) -> np.ndarray:
-        """The pose of the next scan (N, 3)."""
+        """Return the pose (4, 4) of the next scan (N, 3) in the frame of the first scan."""
         self._icp.register_frame(np.asarray(xyz, np.float64), np.zeros(0))
         return np.array(self._icp.last_pose)

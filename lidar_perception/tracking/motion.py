@@ -1,9 +1,9 @@
-"""Extended Kalman filters of N objects on the ground, all at once.
+"""Batched extended Kalman filters of N objects on the ground.
 
-State [x y vx vy heading turn], metres, seconds, radians, in a fixed frame: a velocity that turns at
-a constant rate (Li and Jilkov, IEEE TAES 2003, Section V.B: coordinated turn with Cartesian
-velocity). With a turn rate of 0 without variance it is the filter of constant velocity. means are
-(N, 6), covariances (N, 6, 6), both float64; N may be 0.
+The state is [x y vx vy heading turn] in metres, seconds and radians in a fixed frame, with a
+velocity that turns at a constant rate (coordinated turn with Cartesian velocity; Li and Jilkov,
+IEEE TAES 2003, Section V.B). With zero turn rate and turn variance it is the constant velocity
+filter. means are (N, 6), covariances (N, 6, 6), both float64; N may be 0.
 """
 
 from __future__ import annotations
@@ -14,18 +14,20 @@ from lidar_perception.geometry import wrap_angle, wrap_line
 
 X, Y, VX, VY, HEADING, TURN = range(6)
 MEASURED = np.array([X, Y, HEADING])
-OPPOSITE = 1.0   # scores by which measured headings must speak against a heading to turn it
-STRAIGHT = 1e-4  # rad in one step; below this a series takes the place of sin(a) / a
+MIN_OPPOSING_SCORE = 1.0  # sum of scores of opposite measured headings that flips a heading
+MIN_TURN_RAD = 1e-4       # per step; a smaller turn uses the series of sin(a) / a
 
 
 def predict(means: np.ndarray, covariances: np.ndarray, seconds: float, acceleration: np.ndarray,
             turning: np.ndarray, wandering: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means and covariances so many seconds (0 or more) later; acceleration, turning and wandering
-    (N,) are the densities of MotionParams."""
+    """Predict means and covariances `seconds` (0 or more) ahead.
+
+    acceleration, turning and wandering (N,) are the noise densities of MotionParams.
+    """
     t, count = seconds, len(means)
     _, _, vx, vy, _, turn = means.T
     angle = turn * t
-    straight = np.abs(angle) < STRAIGHT
+    straight = np.abs(angle) < MIN_TURN_RAD
     safe = np.where(straight, 1.0, turn)
     sin, cos = np.sin(angle), np.cos(angle)
     along = np.where(straight, t, sin / safe)
@@ -47,37 +49,41 @@ def predict(means: np.ndarray, covariances: np.ndarray, seconds: float, accelera
     f[:, Y, TURN] = across_by_turn * vx + along_by_turn * vy
     f[:, VX, TURN], f[:, VY, TURN] = -t * later[:, VY], t * later[:, VX]
     f[:, HEADING, TURN] = t
-    grown = f @ covariances @ f.transpose(0, 2, 1)
+    predicted = f @ covariances @ f.transpose(0, 2, 1)
     for place, speed, density in ((X, VX, acceleration), (Y, VY, acceleration),
                                   (HEADING, TURN, turning)):
         square = density * density
-        grown[:, place, place] += square * t ** 3 / 3
-        grown[:, place, speed] += square * t * t / 2
-        grown[:, speed, place] += square * t * t / 2
-        grown[:, speed, speed] += square * t
-    grown[:, HEADING, HEADING] += wandering * wandering * t
-    return later, grown
+        predicted[:, place, place] += square * t ** 3 / 3
+        predicted[:, place, speed] += square * t * t / 2
+        predicted[:, speed, place] += square * t * t / 2
+        predicted[:, speed, speed] += square * t
+    predicted[:, HEADING, HEADING] += wandering * wandering * t
+    return later, predicted
 
 
 def update(means: np.ndarray, covariances: np.ndarray, measured: np.ndarray,
            noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """With measured (N, 3) [x y heading], whose standard deviations are noise (N, 3). Of heading
-    and its opposite the one nearer to the state's is taken: detectors confuse front and rear, of
-    which facing_forward() decides."""
+    """Update with measured (N, 3) [x y heading] of standard deviations noise (N, 3).
+
+    The measured heading or its opposite is used, whichever is nearer to the state's: detectors
+    confuse front and rear, which flip_reversed_headings() decides.
+    """
     innovation = measured - means[:, MEASURED]
     innovation[:, 2] = wrap_line(innovation[:, 2])
     against = covariances[:, :, MEASURED]
     spread = against[:, MEASURED]
     spread[:, range(3), range(3)] += noise * noise
     gain = np.linalg.solve(spread, against.transpose(0, 2, 1)).transpose(0, 2, 1)
-    return _after(means + (gain @ innovation[:, :, None])[:, :, 0],
+    return _normalize(means + (gain @ innovation[:, :, None])[:, :, 0],
                   covariances - gain @ against.transpose(0, 2, 1))
 
 
-def keep_to_heading(means: np.ndarray, covariances: np.ndarray,
-                    slip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """With the knowledge that the speed across the heading is 0, with standard deviations slip
-    (N,): wheels and feet go forward. It ties the heading to the motion, and the other way round."""
+def constrain_to_heading(means: np.ndarray, covariances: np.ndarray,
+                         slip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Update with a lateral speed of 0, of standard deviations slip (N,).
+
+    Wheels and feet go forward, so this couples the heading and the direction of motion.
+    """
     sin, cos = np.sin(means[:, HEADING]), np.cos(means[:, HEADING])
     vx, vy = means[:, VX], means[:, VY]
     slope = np.zeros((len(means), 6))
@@ -86,32 +92,42 @@ def keep_to_heading(means: np.ndarray, covariances: np.ndarray,
     spread = (slope * against).sum(axis=1) + slip * slip
     gain = against / spread[:, None]
     across = cos * vy - sin * vx
-    return _after(means - gain * across[:, None],
+    return _normalize(means - gain * across[:, None],
                   covariances - gain[:, :, None] * against[:, None, :])
 
 
-def facing_forward(means: np.ndarray, said: np.ndarray,
-                   backwards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The means, and what measured headings said for theirs, said (N,), turned round where an
-    object goes backwards faster than backwards (N,) m/s, and, unless it goes forward faster than
-    that, where they said the opposite."""
+def flip_reversed_headings(means: np.ndarray, agreement: np.ndarray,
+                           backwards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Reverse the headings that point backwards.
+
+    A heading is reversed if the object moves backwards faster than backwards (N,) m/s, or if it
+    does not move forward faster than that and the measured headings oppose it: agreement (N,) is
+    the sum of the scores of agreeing headings less that of opposite ones.
+
+    Returns the new means and agreements.
+    """
     forward = (np.cos(means[:, HEADING]) * means[:, VX]
                + np.sin(means[:, HEADING]) * means[:, VY])
-    wrong = (forward < -backwards) | (said < -OPPOSITE) & (forward <= backwards)
-    turned = means.copy()
-    turned[:, HEADING] = wrap_angle(means[:, HEADING] + np.pi * wrong)
-    return turned, np.where(wrong, -said, said)
+    wrong = ((forward < -backwards)
+             | (agreement < -MIN_OPPOSING_SCORE) & (forward <= backwards))
+    flipped = means.copy()
+    flipped[:, HEADING] = wrap_angle(means[:, HEADING] + np.pi * wrong)
+    return flipped, np.where(wrong, -agreement, agreement)
 
 
-def _after(means: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Heading wrapped, covariances symmetric."""
+def _normalize(means: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Wrap the headings and make the covariances symmetric."""
     means[:, HEADING] = wrap_angle(means[:, HEADING])
     return means, (covariances + covariances.transpose(0, 2, 1)) / 2
 
 
-def turned(covariances: np.ndarray, cos: float, sin: float, side: float = 1.0) -> np.ndarray:
-    """The covariances in axes in which the old x lies at [cos sin], and the old y to its left, or
-    with side -1 to its right, as seen from below."""
+def rotate_covariances(covariances: np.ndarray, cos: float, sin: float,
+                       side: float = 1.0) -> np.ndarray:
+    """Express covariances in axes in which the old x axis is [cos sin].
+
+    The old y axis points to the left of the old x axis, or with side -1, for an upside-down frame,
+    to its right.
+    """
     r = np.diag([cos, side * cos, cos, side * cos, side, side])
     for a, b in ((X, Y), (VX, VY)):
         r[a, b], r[b, a] = -side * sin, sin

@@ -1,4 +1,4 @@
-"""What is known of N tracks: one array for each quantity, in the order of birth."""
+"""State of N tracks as one array per quantity, oldest track first, and the published tracks."""
 
 from __future__ import annotations
 
@@ -11,14 +11,22 @@ from lidar_perception.types import CLASSES, Detections
 
 @dataclass(frozen=True)
 class States:
-    """Of N tracks, in the fixed frame.
+    """State of N tracks in the fixed frame.
 
-    ids (N,) int64; means (N, 6), covariances (N, 6, 6) as in motion.py; heights (N,) z of the
-    centre and height_variances (N,); sizes (N, 3) l w h, means with size_weights (N,);
-    class_evidence (N, CLASSES) and class_ids (N,) int32; total, looks (N,) as in
-    existence.py; present (N,) log odds of being there; hits, tries (N,); moving (N,) probability;
-    ages (N,) seconds since birth; unseen (N,) seconds since the last hit; facing (N,) scores of
-    measured headings that agree with that of means less those opposite to it, faded by each.
+    Attributes:
+        ids: (N,) int64.
+        means, covariances: (N, 6) and (N, 6, 6), see motion.py.
+        heights, height_variances: (N,) z of the centre.
+        sizes, size_weights: (N, 3) weighted mean of l w h, and (N,) its weight.
+        class_evidence, class_ids: (N, CLASSES) sum of scores per class, and (N,) int32.
+        total, observations: (N,) evidence and number of observations, see existence.py.
+        present: (N,) log odds of presence.
+        hits, tries: (N,) decayed counts.
+        moving: (N,) probability of motion.
+        ages: (N,) seconds since the first detection.
+        unseen: (N,) seconds since the last hit.
+        heading_agreement: (N,) decayed sum of the scores of measured headings that agree with the
+            state's, less those of opposite ones.
     """
 
     ids: np.ndarray
@@ -31,55 +39,61 @@ class States:
     class_evidence: np.ndarray
     class_ids: np.ndarray
     total: np.ndarray
-    looks: np.ndarray
+    observations: np.ndarray
     present: np.ndarray
     hits: np.ndarray
     tries: np.ndarray
     moving: np.ndarray
     ages: np.ndarray
     unseen: np.ndarray
-    facing: np.ndarray
+    heading_agreement: np.ndarray
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def take(self, indices: np.ndarray) -> States:
-        """The tracks at indices (M,)."""
+        """Return the tracks at indices (M,)."""
         return States(*(getattr(self, f.name)[indices] for f in fields(self)))
 
     def copy(self) -> States:
-        """With arrays of its own."""
+        """Return a copy with its own arrays."""
         return States(*(getattr(self, f.name).copy() for f in fields(self)))
 
-    def followed_by(self, others: States) -> States:
-        """These and then the others."""
+    def append(self, others: States) -> States:
+        """Return these tracks followed by the others."""
         return States(*(np.concatenate([getattr(self, f.name), getattr(others, f.name)])
                         for f in fields(self)))
 
     @staticmethod
     def none() -> States:
-        """No track."""
+        """Return the state without tracks."""
         shapes = {"means": (6,), "covariances": (6, 6), "sizes": (3,),
                   "class_evidence": (len(CLASSES),)}
         kinds = {"ids": np.int64, "class_ids": np.int32}
         return States(*(np.zeros((0, *shapes.get(f.name, ())), kinds.get(f.name, np.float64))
                         for f in fields(States)))
 
-    def boxes(self) -> np.ndarray:
-        """(N, 7) float64 [x y z l w h yaw]."""
+    def to_boxes(self) -> np.ndarray:
+        """Return the boxes (N, 7) float64 [x y z l w h yaw]."""
         return np.column_stack([self.means[:, :2], self.heights, self.sizes, self.means[:, 4]])
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """K tracks of one frame, in the sensor's frame; none is K = 0.
+    """K tracks of one frame in the sensor's frame; K may be 0.
 
-    ids (K,) int64 from 1, never given twice; detections: their boxes, classes, and as scores the
-    probability that they are what they are said to be, and there. velocities (K, 2) m/s over the
-    ground along the sensor's x and y (relative to the sensor where there were no poses), moving
-    (K,) 0..1 the probability of motion. covariances (K, 6, 6) of [x y vx vy heading turn],
-    turn_rates (K,) rad/s, height_variances (K,) m^2 of z. seen (K,) bool: hit in this frame, else
-    predicted; ages (K,) seconds.
+    Attributes:
+        ids: (K,) int64 from 1, never reused.
+        detections: boxes and classes; the score is the probability that the object is real, of its
+            class, and present.
+        velocities: (K, 2) m/s over ground along the sensor's x and y axes, or relative to the
+            sensor if there are no poses.
+        moving: (K,) probability of motion, 0..1.
+        covariances: (K, 6, 6) of [x y vx vy heading turn].
+        turn_rates: (K,) rad/s.
+        height_variances: (K,) variance of z, m^2.
+        seen: (K,) bool, False for tracks that are only predicted in this frame.
+        ages: (K,) seconds since the first detection.
     """
 
     ids: np.ndarray
@@ -95,12 +109,13 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def pose_covariances(self) -> np.ndarray:
-        """(K, 6, 6) float64 of x y z and the turns about them, as geometry_msgs has it; a box
-        turns about z alone."""
-        found = np.zeros((len(self), 6, 6))
-        flat, heading = [0, 1, 5], [0, 1, 4]  # x y and the turn about z; there, and in covariances
-        found[:, np.array(flat)[:, None], flat] = self.covariances[:, np.array(heading)[:, None],
-                                                                   heading]
-        found[:, 2, 2] = self.height_variances
-        return found
+    def to_pose_covariances(self) -> np.ndarray:
+        """Return the covariances (K, 6, 6) float64 of x y z and the rotations about these axes.
+
+        The layout is that of geometry_msgs/PoseWithCovariance; roll and pitch have none.
+        """
+        result = np.zeros((len(self), 6, 6))
+        rows, source = np.array([0, 1, 5]), np.array([0, 1, 4])  # x, y, yaw
+        result[:, rows[:, None], rows] = self.covariances[:, source[:, None], source]
+        result[:, 2, 2] = self.height_variances
+        return result

@@ -1,4 +1,4 @@
-"""The ways of tracks."""
+"""Past positions of tracks."""
 
 from __future__ import annotations
 
@@ -8,33 +8,41 @@ import numpy as np
 
 from lidar_perception.tracking.state import Tracks
 
-TRAIL_POINTS = 20  # of one track
+TRAIL_POINTS = 20  # per track
 
 
 class Trails:
-    """Where each track was lately."""
+    """The recent positions of each track."""
 
     def __init__(self) -> None:
-        self._ways: dict[int, deque[tuple[int, np.ndarray]]] = {}
+        self._trails: dict[int, deque[tuple[int, np.ndarray]]] = {}
 
     def __call__(self, tracks: Tracks, pose: np.ndarray, stamp_ns: int,
                  seconds: float) -> list[np.ndarray]:
-        """The last so many seconds of each of K tracks, K times (N, 3) float64, N from 1 to
-        TRAIL_POINTS, so far apart in time that these reach, oldest first and last its place now,
-        in the frame whose pose (4, 4) this is, that of the tracks. A track that is left out once
-        begins anew."""
+        """Return the trail of each of K tracks over the last `seconds`.
+
+        A trail is an array (N, 3) float64 with N from 1 to TRAIL_POINTS, oldest position first and
+        the current one last, thinned so that it covers the whole time. A track that is missing
+        from one call starts a new trail.
+
+        Args:
+            tracks: K tracks.
+            pose: (4, 4) frame of the tracks, and of the trails, in a fixed frame.
+            stamp_ns: time of the tracks.
+            seconds: length of a trail.
+        """
         length = int(seconds * 1e9)
-        oldest, apart = stamp_ns - length, length // (TRAIL_POINTS + 1)  # + 1: frames are not even
+        oldest, min_gap = stamp_ns - length, length // (TRAIL_POINTS + 1)  # + 1: uneven frames
         centres = tracks.detections.boxes[:, :3].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-        before, self._ways = self._ways, {}
+        previous, self._trails = self._trails, {}
         for number, centre in zip(tracks.ids.tolist(), centres):
-            way = before.get(number) or deque(maxlen=TRAIL_POINTS)
-            while way and way[0][0] < oldest:
-                way.popleft()
-            if len(way) > 1 and way[-1][0] - way[-2][0] < apart:
-                way.pop()  # the last place, too near to the one before to stay
-            way.append((stamp_ns, centre))
-            self._ways[number] = way
+            trail = previous.get(number) or deque(maxlen=TRAIL_POINTS)
+            while trail and trail[0][0] < oldest:
+                trail.popleft()
+            if len(trail) > 1 and trail[-1][0] - trail[-2][0] < min_gap:
+                trail.pop()  # the last position, too soon after the previous one
+            trail.append((stamp_ns, centre))
+            self._trails[number] = trail
         back = np.linalg.inv(pose)
-        return [np.array([place for _, place in way]) @ back[:3, :3].T + back[:3, 3]
-                for way in self._ways.values()]
+        return [np.array([position for _, position in trail]) @ back[:3, :3].T + back[:3, 3]
+                for trail in self._trails.values()]

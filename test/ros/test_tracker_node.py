@@ -111,8 +111,8 @@ def assert_tracked(frames, messages, poses, params):
     tracker, shown, messages = Tracker(params), [], iter(messages)
     for frame in map(from_marker_array, frames):
         tracks = tracker(to_detections(frame), frame.stamp_ns, poses.get(frame.stamp_ns))
-        shown.append(tracks if tracker.taken else None)
-        if tracker.taken and (message := next(messages, None)) is not None:
+        shown.append(tracks if tracker.frame_used else None)
+        if tracker.frame_used and (message := next(messages, None)) is not None:
             assert read(message)[0] == frame.stamp_ns
             assert message.markers[0].header.frame_id == "velodyne"
             assert_same(message, tracks)
@@ -184,7 +184,7 @@ def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes,
     found = cars(car(10))
     for _ in range(3):
         assert read(send(frame(found)))[1] == [1]
-    for late, words in (0, "has the stamp of the one before"), (3, "older than the last one"):
+    for late, words in (0, "same stamp as the previous one"), (3, "older than the previous one"):
         old = make_detection_markers(found, header(now - late * TENTH), bag_message)
         send(old, words, answered=False)
     send(bag_message(MARKERS), "an array without a marker", answered=False)
@@ -192,7 +192,7 @@ def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes,
     gone = bag_message("visualization_msgs/msg/Marker", header=header(now), action=DELETEALL)
     assert read(send(bag_message(MARKERS, markers=[gone])))[:2] == (now, [1])  # missed once
     bad = Detections.of([car(10), car(np.nan), [1, 1, 1, 0, 1, 1, 0]], CAR, [0.9, 0.9, np.nan])
-    assert read(send(frame(bad), "2 of 3 detections are no boxes"))[1] == [1]
+    assert read(send(frame(bad), "2 of 3 detections are ignored"))[1] == [1]
     many = np.random.default_rng(0).uniform(1, 80, (10_000, 7))
     crowded = send(frame(Detections.of(many, CAR, 0.9)), "10000 detections are too many")
     assert len(read(crowded)[1]) <= 300
@@ -205,7 +205,7 @@ def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes,
 
     assert read(send(make_detection_markers(found, header(0), bag_message), "no stamps"))[0] == 0
     move([pose(0.8 * i) for i in range(12)])
-    send(frame(found), "poses began")
+    send(frame(found), "first pose arrived")
     for i in range(1, 12):
         last = send(frame(cars(car(10 - 0.8 * i))))
     assert np.abs(read(last)[3][0]).max() < 0.3  # what stands, stands

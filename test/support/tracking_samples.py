@@ -1,4 +1,4 @@
-"""Objects on straight ways, as detections and poses, that several test files track."""
+"""Simple objects, detections and poses for tests of tracking."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def pose(x, y=0.0, yaw=0.0):
 
 
 def crowd(seed=0, frames=20):
-    """Cars, cyclists and people on straight ways, in the fixed frame, seen with noise."""
+    """Yield noisy detections of objects on straight lines, in the fixed frame."""
     rng = np.random.default_rng(seed)
     kinds = np.array([CAR, CAR, CYCLIST, PEDESTRIAN, PEDESTRIAN, PEDESTRIAN])
     start = np.array([car(10), car(20, 8, np.pi), car(15, -8), person(8, 4), person(12, -4),

@@ -1,4 +1,4 @@
-"""Whence the sensor's motion is known, and what KISS-ICP makes of scans where nothing says it."""
+"""Choice of the source of the sensor's motion, and odometry by KISS-ICP."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from tracking_samples import pose
 from lidar_perception.data.frame import POSES, Frame, Recording
 from lidar_perception.simulation.drive import simulate_drive
 from lidar_perception.tracking import drive_tracker, ego
-from lidar_perception.tracking.drive_tracker import LOOKED_AT, ego_of
+from lidar_perception.tracking.drive_tracker import MAX_POSE_CHECKS, choose_ego_source
 from lidar_perception.tracking.ego import (
     NO_SOURCE,
     SOURCES,
     Odometry,
-    best_source,
-    recorded_poses,
-    recorded_source,
+    choose_recorded_source,
+    choose_source,
+    make_pose_reader,
 )
 from lidar_perception.tracking.params import EGO_SOURCES, RECORDED_EGO
 from lidar_perception.types import InputError
@@ -30,40 +30,40 @@ SETS = [{*chosen} for chosen in chain.from_iterable(
     combinations(SOURCES, count) for count in range(len(SOURCES) + 1))]
 
 
-@pytest.mark.parametrize("there", SETS, ids=lambda names: "+".join(sorted(names)) or "nothing")
-def test_the_best_source_that_is_there_is_taken_and_more_sources_never_give_a_worse_one(there):
+@pytest.mark.parametrize("available", SETS, ids=lambda names: "+".join(sorted(names)) or "nothing")
+def test_best_available_source_is_chosen(available):
     def rank(name):
         return (*SOURCES, NO_SOURCE).index(name)
-    best = best_source("auto", there)
-    assert rank(best) == min(map(rank, there), default=rank(NO_SOURCE))
+    best = choose_source("auto", available)
+    assert rank(best) == min(map(rank, available), default=rank(NO_SOURCE))
     for name in SOURCES:
-        assert best_source(name, there) == (name if name in there else NO_SOURCE)
-        assert rank(best_source("auto", {*there, name})) == min(rank(best), rank(name))
-    assert best_source(NO_SOURCE, there) == NO_SOURCE
+        assert choose_source(name, available) == (name if name in available else NO_SOURCE)
+        assert rank(choose_source("auto", {*available, name})) == min(rank(best), rank(name))
+    assert choose_source(NO_SOURCE, available) == NO_SOURCE
 
 
-def test_every_source_that_can_be_asked_for_is_known():
+def test_source_options_are_the_known_sources():
     assert {*EGO_SOURCES, *RECORDED_EGO} == {"auto", *SOURCES, NO_SOURCE}
 
 
 @pytest.mark.parametrize("installed", [True, False])
-def test_recorded_poses_come_before_the_scans_and_what_is_asked_for_is_not_replaced(monkeypatch,
+def test_recorded_poses_come_before_kiss_icp(monkeypatch,
                                                                                    installed):
     monkeypatch.setattr(ego, "has_odometry", lambda: installed)
-    assert recorded_source(True) == "recording"
-    assert recorded_source(False) == ("kiss_icp" if installed else NO_SOURCE)
+    assert choose_recorded_source(True) == "recording"
+    assert choose_recorded_source(False) == ("kiss_icp" if installed else NO_SOURCE)
     frames = [Frame("0", 0, lambda: None, pose=lambda: np.eye(4))]
     for poses in True, False:
         recording = Recording(Path("drive"), "", frames, frozenset({POSES} if poses else ()))
         for wanted in RECORDED_EGO:
-            assert ego_of(recording, wanted) == recorded_source(poses, wanted)
-            assert wanted == "auto" or recorded_source(poses, wanted) == wanted
+            assert choose_ego_source(recording, wanted) == choose_recorded_source(poses, wanted)
+            assert wanted == "auto" or choose_recorded_source(poses, wanted) == wanted
 
 
 @pytest.mark.parametrize("installed", [True, False])
-@pytest.mark.parametrize("first", [0, LOOKED_AT - 1, LOOKED_AT, 200])
-def test_poses_that_the_first_frames_have_not_give_way_to_the_scans(monkeypatch, installed, first):
-    """And no frame after these is read to see it: a bag can be an hour long."""
+@pytest.mark.parametrize("first", [0, MAX_POSE_CHECKS - 1, MAX_POSE_CHECKS, 200])
+def test_kiss_icp_replaces_poses_missing_at_the_start(monkeypatch, installed, first):
+    """No later frame is read for the choice: a bag can be an hour long."""
     for module in ego, drive_tracker:
         monkeypatch.setattr(module, "has_odometry", lambda: installed)
     read = []
@@ -76,15 +76,17 @@ def test_poses_that_the_first_frames_have_not_give_way_to_the_scans(monkeypatch,
 
     frames = [Frame(str(i), i, lambda: None, pose=partial(pose_of, i)) for i in range(200)]
     recording = Recording(Path("drive"), "", frames, frozenset({POSES}))
-    assert ego_of(recording) == ("kiss_icp" if installed and first >= LOOKED_AT else "recording")
-    assert ego_of(recording, "recording") == "recording"
-    assert read == [*range(min(first + 1, LOOKED_AT))] * installed
+    assert choose_ego_source(recording) == (
+        "kiss_icp" if installed and first >= MAX_POSE_CHECKS else "recording"
+    )
+    assert choose_ego_source(recording, "recording") == "recording"
+    assert read == [*range(min(first + 1, MAX_POSE_CHECKS))] * installed
 
 
-def test_without_the_extra_it_is_said_how_to_get_it(monkeypatch):
+def test_missing_kiss_icp_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "kiss_icp.config.parser", None)
     with pytest.raises(InputError, match=r"lidar_perception\[odometry\]"):
-        recorded_poses("kiss_icp")
+        make_pose_reader("kiss_icp")
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +95,7 @@ def drive():
     return [(scan.frame.xyz, scan.pose) for scan in simulate_drive(5, 6)]
 
 
-def test_odometry_says_how_a_simulated_drive_went_and_always_the_same(drive):
+def test_odometry_of_simulated_drive_is_repeatable(drive):
     first, again = Odometry(), Odometry()
     for xyz, at in drive:
         found = first(xyz)
@@ -103,8 +105,8 @@ def test_odometry_says_how_a_simulated_drive_went_and_always_the_same(drive):
         assert np.abs(found[:3, :3] - step[:3, :3]).max() < 5e-3
 
 
-def test_few_points_are_registered_all_the_same(drive):
-    """As in a small room, where a coarse grid would leave next to nothing."""
+def test_odometry_registers_small_scans(drive):
+    """In a small room a coarse grid leaves too few points."""
     xyz = drive[0][0]
     near = xyz[np.linalg.norm(xyz[:, :2], axis=1) < 12]
     odometry = Odometry()

@@ -1,4 +1,4 @@
-"""The filter of the tracker: what its model says, and what measuring does to it."""
+"""The Kalman filter of the tracker: prediction, updates and heading."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.tracking.motion import (
-    facing_forward,
-    keep_to_heading,
+    constrain_to_heading,
+    flip_reversed_headings,
     predict,
-    turned,
+    rotate_covariances,
     update,
 )
 
@@ -27,7 +27,7 @@ def spread(seed=0, count=1):
 
 
 @given(STATE, st.floats(0, 2), st.floats(0, 2))
-def test_two_steps_are_one_long_step(state, first, second):
+def test_two_predictions_equal_one_long_prediction(state, first, second):
     means, p = np.array([state]), spread()
     at_once = predict(means, p, first + second, NONE, NONE, NONE)
     again = predict(*predict(means, p, first, NONE, NONE, NONE), second, NONE, NONE, NONE)
@@ -37,7 +37,7 @@ def test_two_steps_are_one_long_step(state, first, second):
 
 
 @given(STATE, st.floats(0.01, 0.5))
-def test_the_covariance_grows_along_the_slope_of_the_motion(state, seconds):
+def test_covariance_prediction_matches_numeric_jacobian(state, seconds):
     means, p = np.array([state]), spread(3)
     _, grown = predict(means, p, seconds, NONE, NONE, NONE)
     step, slope = 1e-5, np.zeros((6, 6))
@@ -50,13 +50,13 @@ def test_the_covariance_grows_along_the_slope_of_the_motion(state, seconds):
     np.testing.assert_allclose(grown[0], slope @ p[0] @ slope.T, rtol=1e-3, atol=1e-2)
 
 
-def test_the_speed_stays_and_the_way_bends_as_the_turn_rate_says():
+def test_constant_turn_rate_gives_a_circle():
     circle = np.array([[0.0, 0.0, 2.0, 0.0, 0.0, np.pi / 2]])
     means, _ = predict(circle, spread(), 4.0, NONE, NONE, NONE)  # once around
     np.testing.assert_allclose(means, circle, atol=1e-9)
 
 
-def test_measuring_makes_surer_and_pulls_to_what_is_measured():
+def test_update_shrinks_covariance_and_moves_to_measurement():
     means, p = np.zeros((4, 6)), spread(1, 4)
     measured = np.full((4, 3), 0.3)
     after, narrower = update(means, p, measured, np.full((4, 3), 0.1))
@@ -68,7 +68,7 @@ def test_measuring_makes_surer_and_pulls_to_what_is_measured():
 
 
 @given(st.floats(-3.1, 3.1), st.floats(-1.4, 1.4))
-def test_front_and_rear_measure_the_same(heading, off):
+def test_opposite_headings_give_same_update(heading, off):
     means = np.array([[0, 0, 0, 0, heading, 0.0]])
     ends = [update(means, spread(2), np.array([[0.1, 0.2, heading + off + k * np.pi]]),
                    np.full((1, 3), 0.2))[0] for k in (0, 1)]
@@ -76,23 +76,26 @@ def test_front_and_rear_measure_the_same(heading, off):
     assert wrap_angle(ends[0][0, 4] - ends[1][0, 4]) == pytest.approx(0, abs=1e-7)
 
 
-def test_what_drives_slips_no_more_and_what_drives_backwards_fast_has_its_rear_in_front():
+def test_lateral_speed_shrinks_and_reversed_heading_flips():
     means = np.array([[0.0, 0, 5, 1, 0, 0]])
-    kept, p = keep_to_heading(means, np.eye(6)[None], np.array([0.1]))
+    kept, p = constrain_to_heading(means, np.eye(6)[None], np.array([0.1]))
     across = [np.cos(m[4]) * m[3] - np.sin(m[4]) * m[2] for m in (means[0], kept[0])]
     assert abs(across[1]) < 0.2 * abs(across[0]) and (np.linalg.eigvalsh(p) > 0).all()
     backwards = np.array([[0.0, 0, -5, 0, 0.2, 0], [0, 0, -0.5, 0, 0.2, 0]])
-    turned_round, said = facing_forward(backwards, np.array([9.0, 9.0]), np.array([2.0, 2.0]))
-    assert turned_round[:, 4] == pytest.approx([0.2 - np.pi, 0.2])
-    assert said.tolist() == [-9, 9] and facing_forward(turned_round, said, np.full(2, 2.0))[
-        0].tolist() == turned_round.tolist()  # what was measured does not turn it back
+    flipped, agreement = flip_reversed_headings(
+        backwards, np.array([9.0, 9.0]), np.array([2.0, 2.0])
+    )
+    assert flipped[:, 4] == pytest.approx([0.2 - np.pi, 0.2])
+    assert agreement.tolist() == [-9, 9]
+    again, _ = flip_reversed_headings(flipped, agreement, np.full(2, 2.0))
+    assert again.tolist() == flipped.tolist()  # the measured headings do not flip it back
 
 
-def test_covariances_turn_with_the_axes():
+def test_covariances_rotate_with_axes():
     angle = 0.7
     cos, sin = np.cos(angle), np.sin(angle)
     p = spread(5)
-    there = turned(p, cos, sin)
-    np.testing.assert_allclose(turned(there, cos, -sin), p, atol=1e-12)
+    rotated = rotate_covariances(p, cos, sin)
+    np.testing.assert_allclose(rotate_covariances(rotated, cos, -sin), p, atol=1e-12)
     r = np.array([[cos, -sin], [sin, cos]])
-    np.testing.assert_allclose(there[0, 2:4, 2:4], r @ p[0, 2:4, 2:4] @ r.T)
+    np.testing.assert_allclose(rotated[0, 2:4, 2:4], r @ p[0, 2:4, 2:4] @ r.T)

@@ -1,17 +1,17 @@
-"""The tracker on real scans, detections by the weights that come with the package."""
+"""The tracker on real scans with the shipped weights."""
 
 from __future__ import annotations
 
 import pytest
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # other tests cover these lines
 
 FRAMES = 20
 
 
 @pytest.fixture(scope="module")
 def detector(data):
-    """What the detector finds, once for all tests."""
+    """Detections of the first frames, computed once."""
     from lidar_perception.data.open import open_recording
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.detectors.params import MIN_SCORE
@@ -24,18 +24,18 @@ def detector(data):
 
 
 @pytest.mark.parametrize("ego", ["none", "auto"])
-def test_no_identity_switches_on_a_real_drive(data, detector, ego):
-    """Which has no poses: auto takes them from the scans."""
+def test_no_id_switches_on_real_drive(data, detector, ego):
+    """The drive has no poses, so auto uses KISS-ICP."""
     from lidar_perception.data.frame import POSES
     from lidar_perception.data.open import open_recording
     from lidar_perception.scoring.run import fill
     from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker
-    from lidar_perception.tracking.drive_tracker import ego_of
+    from lidar_perception.tracking.drive_tracker import choose_ego_source
     from lidar_perception.tracking.ego import has_odometry
 
     report, drive = TrackingReport(), open_recording(data / "kitti_tracking")
     if ego == "auto" and POSES not in drive.has:
-        assert ego_of(drive) == ("kiss_icp" if has_odometry() else "none")
+        assert choose_ego_source(drive) == ("kiss_icp" if has_odometry() else "none")
     fill(report, drive, by_tracker(lambda: detector, ego=ego), limit=FRAMES)
     cars = report.compute()["classes"]["Car"]
     assert cars["switches"] == 0 and cars["HOTA"] > 0.7

@@ -50,13 +50,13 @@ def tracking(data: Path, split: Path | None, limit: int | None, detector: Detect
     from lidar_perception.scoring.run import fill
     from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker
     from lidar_perception.scoring.tracking.tables import print_tracking_report
-    from lidar_perception.tracking.drive_tracker import ego_of
+    from lidar_perception.tracking.drive_tracker import choose_ego_source
 
     recording = opened(data, split=split)
     recording.require(BOXES, "evaluate tracking")
     open_ = partial(detector.open, min_score=tracking.min_score,
                     sensor_height=recording.frames[0].sensor_height)
-    report, asked, ego = TrackingReport(), ego, ego_of(recording, ego)
+    report, asked, ego = TrackingReport(), ego, choose_ego_source(recording, ego)
     if (asked, ego) == ("auto", "kiss_icp") and POSES in recording.has:
         console.print(Text("no pose", "yellow") + ": the first frames have none, so poses are by "
                       "KISS-ICP; see whether the odometry or TF of the recording has the clock of "

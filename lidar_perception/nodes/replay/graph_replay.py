@@ -28,7 +28,7 @@ from lidar_perception.nodes.graph import (
 from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.terminal import errors, make_progress
-from lidar_perception.tracking.ego import recorded_source
+from lidar_perception.tracking.ego import choose_recorded_source
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
 
@@ -59,7 +59,7 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         clouds, results (number of frames), latency_ms (median and p95 from the arrival of a cloud
         in this process to its detections), memory_mb (proportional set size), memory_mb_by_node,
         slower (slowdown of the replay against `rate`), poses (their source for the tracker, see
-        recorded_source), and for candidates the scores of the evaluator.
+        choose_recorded_source), and for candidates the scores of the evaluator.
 
     Raises:
         InputError: the nodes do not connect, or there is no result.
@@ -72,7 +72,7 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
     topics = {**stages, "tracks": TRACKS}
     domain = reserve_domain()
     with Bag(drive) as bag:
-        poses = recorded_source(ODOMETRY in bag.topics)
+        poses = choose_recorded_source(ODOMETRY in bag.topics)
     scores = out / "logs" / "scores.json"
     settings = {**flatten(params), **({} if real_time else {"input.queue": AHEAD})}
     nodes: dict[str, tuple[Mapping[str, str], dict[str, Any]]] = {

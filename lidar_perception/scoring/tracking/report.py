@@ -68,7 +68,7 @@ def _by_tracker(open_: Callable[[], Detector], params: TrackingParams, ego: str,
             return None
         return replace(observe(tracker.drive, frame.index, truth,
                                tracked_labels(tracks.ids, tracks.detections), frame.calibration()),
-                       posed=tracker.posed)
+                       posed=tracker.has_pose)
     return measure
 
 
