@@ -96,3 +96,14 @@ def test_freed_memory_is_reused_unless_the_user_sets_malloc(user):
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("MALLOC", "GLIBC"))}
     pages = int(subprocess.check_output([sys.executable, "-c", script], env=environment | user))
     assert (pages > 100) == bool(user)
+
+
+@pytest.mark.parametrize("count", [1, 5, 57, 1001])
+def test_processes_get_runs_of_items_and_equal_shares(count):
+    """Consecutive items share work: scans of one street, clouds of one chunk."""
+    items = list(range(count))
+    shares = [processes.deal_items(items, 3, job) for job in range(3)]
+    assert sorted(itertools.chain(*shares)) == items
+    assert max(map(len, shares)) - min(map(len, shares)) <= max(1, count // 48)
+    together = sum(b == a + 1 for share in shares for a, b in itertools.pairwise(share))
+    assert together >= count - 3 * (processes.RUNS_PER_PROCESS + 1) - count % 48

@@ -27,6 +27,7 @@ from lidar_perception.runs.threads import limit_to_one_thread
 from lidar_perception.types import InputError
 
 EXIT_TIMEOUT_S = 30.0  # for processes that have been asked to end
+RUNS_PER_PROCESS = 16  # of consecutive items, which often share work (scans of one street)
 
 
 def run_in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, jobs: int,
@@ -54,13 +55,23 @@ def run_in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence,
     try:
         for j in range(jobs):
             receiver, sender = context.Pipe(duplex=False)
-            running[receiver] = _start_process(context, _run_items, start, items[j::jobs], jobs > 1,
-                                               sender)
+            running[receiver] = _start_process(context, _run_items, start,
+                                               deal_items(items, jobs, j), jobs > 1, sender)
         while running:
             for receiver in cast(list[Connection], wait(list(running))):
                 yield from _receive_result(receiver, running, what)
     finally:
         _end_processes(running)
+
+
+def deal_items(items: Sequence, jobs: int, job: int) -> list:
+    """Return the items of one of several jobs: runs of consecutive items, dealt in turn.
+
+    The shares differ by one run at most, which is at most 1 / RUNS_PER_PROCESS of a share.
+    """
+    run = max(1, len(items) // (jobs * RUNS_PER_PROCESS))
+    return [item for first in range(job * run, len(items), jobs * run)
+            for item in items[first:first + run]]
 
 
 def run_in_order(start: Callable[[], Callable[[Any], Any]], items: Iterable, jobs: int, ahead: int,

@@ -51,6 +51,11 @@ def longest_drive(sensor: Sensor) -> int:
     return int(DRIVE_SECONDS * sensor.rate)
 
 
+def drive_frame(moment: int, moments: int, sensor: Sensor) -> int:
+    """Return the number of the scan at one of several moments spread evenly over a drive."""
+    return moment * longest_drive(sensor) // moments
+
+
 def simulate_drive(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E,
                    scenes: Scenes = ALL_STREETS) -> Iterator[SimulatedScan]:
     """Simulate a drive through make_scene(seed, *scenes); the same for the same arguments.

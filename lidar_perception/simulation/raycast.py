@@ -160,9 +160,14 @@ def _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, count
     for s in order:
         owner, near = shapes.owner[s], seen.near[s]
         counts = counting and owner > 0
-        for step in range(seen.count[s]):
+        highest, lowest = 0, rings
+        while lowest > 0 and not seen.beams[s, lowest - 1]:
+            lowest -= 1
+        while highest < lowest and not seen.beams[s, highest]:
+            highest += 1
+        for step in range(seen.count[s] if highest < lowest else 0):
             column = (seen.first[s] + step) % columns
-            for ring in range(rings):
+            for ring in range(highest, lowest):
                 if not seen.beams[s, ring] or not only[column, ring]:
                     continue
                 far = hits.range[column, ring]

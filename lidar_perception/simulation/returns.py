@@ -72,16 +72,20 @@ def make_returns(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Gene
     keep &= (rng.random(shape) >= sensor.dropout) & sensor.open_rays()
     # Slightly within the limits, so that rounding to float32 does not exceed them.
     keep &= (noisy > sensor.min_range + 1e-4) & (noisy < sensor.max_range - 1e-4)
-    ring, column = np.nonzero(keep.T)
-    origin = np.broadcast_to(turn.origin, turn.direction.shape)
-    xyz = origin[column, ring] + turn.direction[column, ring] * noisy[column, ring, None]
-    intensity = hits.brightness[column, ring] + rng.normal(0.0, INTENSITY_NOISE, len(ring))
-    faded = sensor.fade[1] * np.maximum(hits.range[column, ring] - sensor.fade[0], 0.0)
-    intensity -= np.where(hits.brightness[column, ring] < RETROREFLECTOR, faded, 0.0)
+    ring, column = divmod(np.flatnonzero(keep.T), shape[0])
+    ray = column * shape[1] + ring
+    reached, brightness = hits.range.ravel()[ray], hits.brightness.ravel()[ray]
+    xyz = turn.direction.reshape(-1, 3)[ray]
+    xyz *= noisy.ravel()[ray, None]
+    xyz += turn.origin.reshape(-1, 3)[ray]
+    intensity = brightness + rng.normal(0.0, INTENSITY_NOISE, len(ring))
+    if sensor.fade[1]:
+        faded = sensor.fade[1] * np.maximum(reached - sensor.fade[0], 0.0)
+        intensity -= np.where(brightness < RETROREFLECTOR, faded, 0.0)
     weak = (intensity < sensor.floor) | (rng.random(len(intensity)) < sensor.silent)
     if sensor.biases:
         intensity += np.asarray(sensor.biases)[ring]
     intensity = np.where(weak, 0.0, np.round(np.clip(intensity, 0.0, 1.0), 2))
-    time = make_rays(sensor, motion).since[column]
-    return Returns(xyz.astype(np.float32), intensity.astype(np.float32), hits.owner[column, ring],
-                   hits.semantic[column, ring], ring.astype(np.uint16), time.astype(np.float32))
+    return Returns(xyz.astype(np.float32), intensity.astype(np.float32), hits.owner.ravel()[ray],
+                   hits.semantic.ravel()[ray], ring.astype(np.uint16),
+                   (sensor.times() - motion.stamp / sensor.rate)[column].astype(np.float32))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import reprlib
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -113,11 +113,7 @@ class Sensor:
 
     def directions(self) -> np.ndarray:
         """Return unit vectors (columns, rings, 3), float64, counter-clockwise from ahead."""
-        azimuth = np.arange(self.columns)[:, None] * (2 * np.pi / self.columns)
-        elevation = np.asarray(self.elevations)
-        flat = np.cos(elevation)
-        return np.stack(np.broadcast_arrays(
-            np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)), axis=-1)
+        return _directions(self.elevations, self.columns).copy()
 
     def origins(self) -> np.ndarray:
         """Return the starts of the beams in the sensor's frame, (rings, 3) float64 m."""
@@ -141,6 +137,16 @@ class Sensor:
             within = (azimuth - start) % 360 < wide
             free &= ~(within[:, None] & (ring >= first))
         return free
+
+
+@lru_cache(maxsize=2)
+def _directions(elevations: tuple[float, ...], columns: int) -> np.ndarray:
+    """Return Sensor.directions, which the scans of a sensor share."""
+    azimuth = np.arange(columns)[:, None] * (2 * np.pi / columns)
+    elevation = np.asarray(elevations)
+    flat = np.cos(elevation)
+    return np.stack(np.broadcast_arrays(
+        np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)), axis=-1)
 
 
 class Motion(NamedTuple):
@@ -181,8 +187,9 @@ def make_rays(sensor: Sensor, motion: Motion = NO_MOTION) -> Rays:
     if motion.yaw_rate:  # beams start on the z axis, so only their directions turn
         turned = motion.yaw_rate * since[:, None]
         cos, sin = np.cos(turned), np.sin(turned)
-        x, y, z = np.moveaxis(direction, -1, 0)
-        direction = np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
+        x, y = direction[..., 0].copy(), direction[..., 1].copy()
+        direction[..., 0] = cos * x - sin * y
+        direction[..., 1] = sin * x + cos * y
     return Rays(moved[:, None] + sensor.origins(), direction, since)
 
 

@@ -17,7 +17,7 @@ from lidar_perception.simulation.camera import FORWARD_CAMERA, make_kitti_labels
 from lidar_perception.simulation.drive import simulate_drive, simulate_scan
 from lidar_perception.simulation.scene import CROWDED_ZONES
 from lidar_perception.simulation.sensor import SENSORS
-from lidar_perception.types import SENSOR_HEIGHT
+from lidar_perception.types import SENSOR_HEIGHT, InputError
 
 pytestmark = [pytest.mark.no_cover,  # others run these lines
               pytest.mark.usefixtures("streets", "tiny_sensor")]
@@ -221,6 +221,16 @@ def test_training_scans_are_streets_in_order():
         assert np.allclose(batch["boxes"], scan.truth.boxes)
         assert batch["class_ids"].tolist() == scan.truth.class_ids.tolist()
         assert batch["num_points"].tolist() == [e["num_points"] for e in scan.truth.extras]
+
+
+def test_training_scans_share_a_street_between_moments():
+    scans = [(street, frame) for street in (3, 4) for frame in (0, 66, 133)]
+    for (street, frame), batch in zip(scans, generate_training_scans(3, TINY, moments=3)):
+        scan = simulate_scan(street, frame, TINY)
+        assert np.array_equal(batch["points"][:, :3], scan.frame.xyz)
+        assert np.allclose(batch["boxes"], scan.truth.boxes)
+    with pytest.raises(InputError, match="moments = 0 must be 1"):
+        generate_training_scans(3, TINY, moments=0)
 
 
 class Streets(torch.utils.data.IterableDataset):
