@@ -17,7 +17,7 @@ from benchmark.rows import against, measured
 from benchmark.timing import Clock, evenly_chosen
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import FUSED, DetectionResult
-from lidar_perception.detectors.devices import chosen_device
+from lidar_perception.detectors.devices import find_device
 from lidar_perception.detectors.open import POINTPILLARS, open_detector
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS, network_config
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
@@ -40,7 +40,7 @@ def measure_detection(scans: list[PointCloud], repeat: int,
     """Medians over whole scans, each `repeat` times, versions taken in turn, all in torch. Weights
     are random: time depends on them only by what passes the thresholds, which are set to let
     CANDIDATES anchors through."""
-    device = chosen_device()
+    device = find_device()
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else read_cpu_name()
     content: dict[str, Any] = {"device": name, "threads": torch.get_num_threads(), "sizes": {}}
     for size in sizes:

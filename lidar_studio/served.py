@@ -37,7 +37,7 @@ class Served:
         """As /api/drive has it."""
         common = {"name": self.drive.name, "mode": "label" if self.session else "view",
                   "classes": classes(), "live": self.live is not None,
-                  "min_score": ScoreParams().of_class(CLASSES[PEDESTRIAN]),
+                  "min_score": ScoreParams().get(CLASSES[PEDESTRIAN]),
                   "can_export": [*FORMATS] if self.session else []}
         if isinstance(self.drive, Live):
             return {**common, "path": "", "layout": "live", "has": [],

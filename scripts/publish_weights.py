@@ -21,8 +21,8 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.detectors import checkpoint
 from lidar_perception.detectors.checkpoint import (
     POINTNET,
-    network_of,
-    require_same,
+    read_network_name,
+    require_same_config,
     save_checkpoint,
 )
 from lidar_perception.detectors.open import open_detector
@@ -99,11 +99,11 @@ def format_card(header: checkpoint.Header, title: str, scored: dict[str, dict[st
 @click.option("--judge", is_flag=True, help="A PointNet for `fused`, not to be used alone.")
 def main(weights: Path, folders: tuple[Path, ...], before: Path | None, judge: bool) -> None:
     """Score, store and describe one checkpoint."""
-    load = load_pointnet if network_of(weights) == POINTNET else load_network
+    load = load_pointnet if read_network_name(weights) == POINTNET else load_network
     header, network = load(weights)
     if before is not None:
         earlier, other = load(before)
-        require_same(header.config, earlier.config, str(before))
+        require_same_config(header.config, earlier.config, str(before))
         state = other.state_dict()
         network.load_state_dict({
             name: (value + state[name]) / 2 if value.is_floating_point() else value

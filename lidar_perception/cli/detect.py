@@ -107,7 +107,7 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
     from lidar_perception.detecting.pictures import FilmOfFrames, FrameDrawer, Pictures
     from lidar_perception.detecting.run import detect as run_detector
     from lidar_perception.detecting.run import header_of
-    from lidar_perception.detectors.open import doubts
+    from lidar_perception.detectors.open import check_weights
     from lidar_perception.rendering.files import check_film
     from lidar_perception.tracking.drive_tracker import choose_ego_source
 
@@ -126,7 +126,7 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
     if video is not None:
         check_film(video, count)
     height = recording.frames[0].sensor_height
-    for doubt in doubts(Path(detector.weights), height):
+    for doubt in check_weights(Path(detector.weights), height):
         errors.print(doubt)
     open_ = partial(detector.open, sensor_height=height, min_score=min_score)
     opened_detector = open_()

@@ -20,7 +20,7 @@ from lidar_perception.data.frame import Recording
 from lidar_perception.detecting.formats import Format, Run, mask_numbers
 from lidar_perception.detecting.results import FrameResult, by_detector, by_record
 from lidar_perception.detectors.contract import Detector
-from lidar_perception.detectors.open import Configured, kind_and_file
+from lidar_perception.detectors.open import ConfigurableDetector, resolve_weights
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.journal import open_journal
 from lidar_perception.scoring.run import complete, fill
@@ -74,7 +74,7 @@ class Summary:
                 "problems": dict(self.problems), "skipped": self.skipped}
 
 
-def header_of(recording: Recording, weights: str, detector: Configured, *,
+def header_of(recording: Recording, weights: str, detector: ConfigurableDetector, *,
               tracking: TrackingParams | None = None, ego: str | None = None,
               **more: Any) -> dict[str, Any]:
     """Return a JSON object with everything that the results of a run depend on: two runs with the
@@ -86,7 +86,7 @@ def header_of(recording: Recording, weights: str, detector: Configured, *,
         ego: the source of poses for the tracks.
         more: other settings.
     """
-    kind, file = kind_and_file(weights)
+    kind, file = resolve_weights(weights)
     digest = None if file is None else hashlib.sha256(file.read_bytes()).hexdigest()[:16]
     return {"version": __version__, "data": str(recording.path.absolute()),
             "layout": recording.layout, "frames_in_data": len(recording), **more,

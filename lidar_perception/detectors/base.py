@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import torch
 
-from lidar_perception.detectors.contract import Cloud, DetectionResult, accept, joined
+from lidar_perception.detectors.contract import Cloud, DetectionResult, accept, join_problems
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
 from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.ground.params import SensorPoseParams, set_sensor_height
@@ -37,7 +37,7 @@ class NetworkDetector:
 
     def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> DetectionResult:
-        """Return the objects in a cloud, see contract.Detector.
+        """Detect the objects in a cloud, see contract.Detector.
 
         Raises:
             InputError: also if CUDA is out of memory and the parameter cpu_fallback is off.
@@ -50,11 +50,11 @@ class NetworkDetector:
             ground, cluster_ids = (column if column is None else column.take(kept)
                                    for column in (ground, cluster_ids))
         found = self.detect(frame, ground, cluster_ids)
-        return replace(found, problem=joined(problem, found.problem)) if problem else found
+        return replace(found, problem=join_problems(problem, found.problem)) if problem else found
 
     def detect(self, frame: PointCloud, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> DetectionResult:
-        """Return the objects in a frame that is checked and cropped already."""
+        """Detect the objects in a checked and cropped frame."""
         raise NotImplementedError
 
     @property
@@ -64,7 +64,7 @@ class NetworkDetector:
 
     @property
     def device(self) -> torch.device:
-        """Device that the first network runs on now."""
+        """Device of the first network."""
         return self.networks[0].device
 
     @property
@@ -85,11 +85,11 @@ class NetworkDetector:
     @property
     def min_scores(self) -> dict[str, float]:
         """Threshold of each class, 0..1."""
-        return self.settings.scores.of_classes(self.classes)
+        return self.settings.scores.get_all(self.classes)
 
     @property
     def range(self) -> str:
-        """What the detector covers: "ahead" of the sensor only, or all "around" it."""
+        """Covered area: "ahead" of the sensor only, or "around" it."""
         low = getattr(self.networks[0].config, "low", None)  # PointNet has no range
         return "around" if low is None or low[0] < 0 else "ahead"
 
@@ -101,7 +101,7 @@ class NetworkDetector:
 
     def with_min_score(self, min_score: float) -> Self:
         """Return this detector with one threshold for all classes."""
-        settings = replace(self.settings, scores=ScoreParams.all_alike(min_score))
+        settings = replace(self.settings, scores=ScoreParams.for_all_classes(min_score))
         return self.with_params(replace(self.params, **{self.group: settings}))
 
     def with_sensor_height(self, height: float) -> Self:
@@ -113,14 +113,14 @@ class NetworkDetector:
 
         Args:
             range: ahead, around, or auto, the range that its weights were trained for. PointNet
-                always sees all around.
+                always covers all directions.
 
         Raises:
-            InputError: the network cannot see that range.
+            InputError: the network cannot cover that range.
         """
         if range == "ahead":
-            raise InputError(f"{self.group} sees all around; leave out what is not wanted with "
-                             "crop.*")
+            raise InputError(f"{self.group} always covers all directions; use the parameters "
+                             "crop.* to limit the area")
         return self
 
     def with_raw_scores(self) -> Self:

@@ -1,8 +1,7 @@
-"""Boxes of a network put right by a second one, and by what is seen around them: the ground, and
-the nearest points.
+"""Corrections of a network's boxes: towards another network's boxes, the ground and the points.
 
-Two networks err differently. One that was trained on simulated scans places cars of real ones too
-far away and not quite on the ground; the points say better where a face that is seen must be.
+Two networks make different errors. A network trained on simulated scans places real cars slightly
+too far away and not exactly on the ground. The points show better where a visible face is.
 """
 
 from __future__ import annotations
@@ -13,73 +12,88 @@ from numba import njit
 from lidar_perception.classes import CAR
 from lidar_perception.geometry import points_in_boxes, wrap_angle, wrap_line
 
-MARGIN = 0.4   # metres around a box in which its points are looked for
-ABOVE = 0.2    # metres above its bottom from which on points count
-FEWEST = 30    # points of a face
-SHARE = 0.03   # of the points of a face are in front of what is called its points' begin
-# Where that is in a labelled box, metres behind the face: of 60 simulated scans.
+MARGIN_M = 0.4          # points up to this distance from a box belong to it
+MIN_HEIGHT_M = 0.2      # lower points of a box are not used
+MIN_FACE_POINTS = 30
+FACE_QUANTILE = 0.03    # quantile of the points of a face that marks its surface
+# Depth of that quantile behind a labelled face, in metres: measured on 60 simulated scans.
 FRONT, REAR, SIDE = 0.03, 0.03, -0.01
-ASLANT = 0.3   # a face counts that is seen at no flatter an angle than this, as a tangent
+MIN_FACE_SLOPE = 0.3    # tangent of the flattest angle at which a face is used
 
 
-def moved_towards(boxes: np.ndarray, others: np.ndarray, share: float) -> np.ndarray:
-    """Boxes (K, 7) moved, turned and resized by this share, 0..1, of what they differ from others
-    (K, 7) of the same objects; those whose other one is NaN stay. Which end is the front stays."""
-    way = np.where(np.isfinite(others), others - boxes, 0.0)
-    way[:, 6] = wrap_line(way[:, 6])
-    moved = boxes + share * way
+def move_towards(boxes: np.ndarray, others: np.ndarray, share: float) -> np.ndarray:
+    """Interpolate between the boxes (K, 7) of two networks.
+
+    Args:
+        others: (K, 7) boxes of the same objects; a box is not changed where its other one is NaN.
+        share: 0 returns `boxes`, 1 returns `others`, but with the heading (front end) of `boxes`.
+    """
+    difference = np.where(np.isfinite(others), others - boxes, 0.0)
+    difference[:, 6] = wrap_line(difference[:, 6])
+    moved = boxes + share * difference
     moved[:, 6] = wrap_angle(moved[:, 6])
     return moved
 
 
-def on_ground(boxes: np.ndarray, floors: np.ndarray, share: float) -> np.ndarray:
-    """Boxes (K, 7) whose bottoms are moved by this share, 0..1, of the way to the ground under
-    them, floors (K,) z; those with NaN stay."""
+def move_to_ground(boxes: np.ndarray, ground_heights: np.ndarray, share: float) -> np.ndarray:
+    """Move boxes (K, 7) vertically towards the ground.
+
+    Args:
+        ground_heights: (K,) z of the ground below each box; a box with NaN is not moved.
+        share: 0 keeps the boxes, 1 moves their bottoms onto the ground.
+    """
     moved = boxes.copy()
-    way = share * (floors - (boxes[:, 2] - boxes[:, 5] / 2))
-    moved[:, 2] += np.where(np.isfinite(way), way, 0.0)
+    offset = share * (ground_heights - (boxes[:, 2] - boxes[:, 5] / 2))
+    moved[:, 2] += np.where(np.isfinite(offset), offset, 0.0)
     return moved
 
 
-def cars_on_points(boxes: np.ndarray, class_ids: np.ndarray, xyz: np.ndarray,
+def move_cars_to_points(boxes: np.ndarray, class_ids: np.ndarray, xyz: np.ndarray,
                    share: float) -> np.ndarray:
-    """Boxes (K, 7) float64, of which the cars, by class_ids (K,), are moved, see on_points."""
+    """Return boxes (K, 7) float64 with the cars moved by move_to_points."""
     moved, cars = np.array(boxes, np.float64), class_ids == CAR
     if share and cars.any():
-        moved[cars] = on_points(moved[cars], xyz, share)
+        moved[cars] = move_to_points(moved[cars], xyz, share)
     return moved
 
 
-def on_points(boxes: np.ndarray, xyz: np.ndarray, share: float) -> np.ndarray:
-    """Boxes (K, 7) moved by this share, 0..1, of the way along their axes that brings the faces
-    that a sensor at 0 sees to where the points (N, 3) begin; at most MARGIN, and a face with less
-    than FEWEST of them stays."""
-    indices, first = points_in_boxes(xyz, boxes, MARGIN)
-    return _on_points(np.asarray(boxes, np.float64), xyz[indices].astype(np.float64), first, share)
+def move_to_points(boxes: np.ndarray, xyz: np.ndarray, share: float) -> np.ndarray:
+    """Move boxes (K, 7) along their axes so that their visible faces fit the points (N, 3).
+
+    The sensor is at the origin. Boxes move by at most MARGIN_M. A face with fewer than
+    MIN_FACE_POINTS points does not move its box.
+
+    Args:
+        share: 0 keeps the boxes, 1 moves the faces all the way.
+    """
+    indices, first = points_in_boxes(xyz, boxes, MARGIN_M)
+    return _move_to_points(np.asarray(boxes, np.float64), xyz[indices].astype(np.float64), first,
+                           share)
 
 
 @njit(cache=True, nogil=True)
-def _on_points(boxes, points, first, share):
+def _move_to_points(boxes, points, first, share):
     moved = boxes.copy()
     for k in range(len(boxes)):
         x, y, z = boxes[k, :3]
         cos, sin = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
         sensor = np.array([-cos * x - sin * y, sin * x - cos * y])
         own = points[first[k]:first[k + 1]]
-        own = own[own[:, 2] > z - boxes[k, 5] / 2 + ABOVE]
+        own = own[own[:, 2] > z - boxes[k, 5] / 2 + MIN_HEIGHT_M]
         flat = np.empty((len(own), 2))
         flat[:, 0] = cos * (own[:, 0] - x) + sin * (own[:, 1] - y)
         flat[:, 1] = cos * (own[:, 1] - y) - sin * (own[:, 0] - x)
         for axis in range(2):
             half, side = boxes[k, 3 + axis] / 2, np.sign(sensor[axis])
-            if abs(sensor[axis]) <= half or abs(sensor[axis]) < ASLANT * abs(sensor[1 - axis]):
+            if abs(sensor[axis]) <= half or (
+                    abs(sensor[axis]) < MIN_FACE_SLOPE * abs(sensor[1 - axis])):
                 continue
             face = flat[np.abs(flat[:, 1 - axis]) <= boxes[k, 4 - axis] / 2 + 0.1]
-            if len(face) < FEWEST:
+            if len(face) < MIN_FACE_POINTS:
                 continue
-            begin = np.quantile(half - side * face[:, axis], SHARE)
+            depth = np.quantile(half - side * face[:, axis], FACE_QUANTILE)
             expected = SIDE if axis == 1 else (FRONT if side > 0 else REAR)
-            way = -side * share * min(max(begin - expected, -MARGIN), MARGIN)
-            moved[k, 0] += way * (cos if axis == 0 else -sin)
-            moved[k, 1] += way * (sin if axis == 0 else cos)
+            offset = -side * share * min(max(depth - expected, -MARGIN_M), MARGIN_M)
+            moved[k, 0] += offset * (cos if axis == 0 else -sin)
+            moved[k, 1] += offset * (sin if axis == 0 else cos)
     return moved

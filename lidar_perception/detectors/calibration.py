@@ -1,8 +1,8 @@
-"""Scores as probabilities: by class a straight line through the log-odds (Platt, 1999).
+"""Calibration of scores to probabilities: a straight line in the log-odds per class (Platt, 1999).
 
-The lines are in the header of the weights, fitted to scans that were not trained on
-(scoring/kitti/reliability.py). They rise, so that the order of scores, and with it average
-precision, stays as it is.
+The header of the weights contains the lines. They are fitted to scans outside the training set
+(scoring/kitti/reliability.py). Their slopes are positive, so the order of scores, and with it
+average precision, does not change.
 """
 
 from __future__ import annotations
@@ -16,23 +16,22 @@ from scipy.special import expit, logit
 
 from lidar_perception.types import CLASSES, Detections
 
-Lines = Mapping[str, tuple[float, float]]  # class -> slope, above 0, and offset, of log-odds
+Lines = Mapping[str, tuple[float, float]]  # class -> (slope > 0, offset), in log-odds
 
 
-def calibrated(detections: Detections, lines: Lines) -> Detections:
-    """The detections with scores that are probabilities, in their order; those of a class without
-    a line stay as they are."""
+def calibrate_scores(detections: Detections, lines: Lines) -> Detections:
+    """Return the detections, in the same order, with probabilities as scores. The scores of classes
+    without a line do not change."""
     scores = detections.scores.copy()
     for name, (slope, offset) in lines.items():
         own = detections.class_ids == CLASSES.index(name)
-        with np.errstate(divide="ignore"):  # of scores 0 and 1, which stay
+        with np.errstate(divide="ignore"):  # scores 0 and 1 are mapped to themselves
             scores[own] = expit(slope * logit(scores[own].astype(np.float64)) + offset)
     return replace(detections, scores=scores)
 
 
-def raw_score(name: str, score: float, lines: Lines) -> float:
-    """The inverse for one score: what the network says, of a class, where it is as likely as
-    score."""
+def to_raw_score(name: str, score: float, lines: Lines) -> float:
+    """Return the raw network score of class `name` that is calibrated to `score`."""
     if name not in lines or score in (0.0, 1.0):
         return score
     slope, offset = lines[name]

@@ -1,4 +1,4 @@
-"""STM-CPA candidates (paper A) as a detector of pedestrians: the pipeline, with its seed source."""
+"""The STM-CPA pipeline (paper A) as a detector of pedestrians."""
 
 from __future__ import annotations
 
@@ -20,8 +20,12 @@ from lidar_perception.types import CLASSES, PEDESTRIAN
 
 @dataclass(frozen=True)
 class CandidateDetector:
-    """A detector, see contract.py. seed: where the seed pedestrian comes from; camera: needed
-    where params crop to its view."""
+    """A detector of pedestrians, see contract.py.
+
+    Attributes:
+        seed: source of the seed pedestrian.
+        camera: required if `params` crop the cloud to the camera's view.
+    """
 
     seed: SeedSource
     camera: Camera | None = None
@@ -29,35 +33,37 @@ class CandidateDetector:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Pedestrian."""
         return (CLASSES[PEDESTRIAN],)
 
     @property
     def _threshold(self) -> str:
-        """The parameter that says from which score on a candidate counts."""
+        """Name of the parameter with the minimum score of a candidate."""
         return "confidence.threshold" if self.params.confidence.enabled else "stm.threshold"
 
     @property
     def min_scores(self) -> Mapping[str, float]:
-        """By class, the least score of a detection."""
+        """Minimum score of a detection, by class."""
         group, name = self._threshold.split(".")
         return {self.classes[0]: getattr(getattr(self.params, group), name)}
 
     def with_min_score(self, min_score: float) -> CandidateDetector:
-        """The same detector with this least score."""
+        """Return a copy of this detector with another threshold."""
         return CandidateDetector(self.seed, self.camera,
                                  with_values(self.params, {self._threshold: min_score}))
 
     def with_sensor_height(self, height: float) -> CandidateDetector:
-        """The same detector for a sensor so many metres above the ground."""
+        """Return a copy of this detector for a sensor `height` metres above the ground."""
         return CandidateDetector(self.seed, self.camera, set_sensor_height(self.params, height))
 
     def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> DetectionResult:
-        """See contract.Detector. InputError where there is no seed, and without a camera where
-        params crop to its view."""
+        """Detect pedestrians, see contract.Detector.
+
+        Raises:
+            InputError: also if there is no seed, or if `params` need a camera and there is none.
+        """
         frame, ground, cluster_ids, _ = accept(cloud, ground, cluster_ids)
         segmented, candidates = find_candidates(frame, self.seed, self.camera, self.params,
                                                 ground=ground, cluster_ids=cluster_ids)
-        return DetectionResult(candidates.final, candidates.ms,
-                     diagnose_empty(len(frame), segmented.ground, segmented.cluster_ids))
+        return DetectionResult(candidates.final, candidates.ms, diagnose_empty(
+            len(frame), segmented.ground, segmented.cluster_ids))

@@ -1,4 +1,4 @@
-"""Weights on disk, of any network: safetensors with a JSON header that says which they are of."""
+"""Checkpoints of all networks: safetensors files with a JSON header that describes the network."""
 
 from __future__ import annotations
 
@@ -13,37 +13,36 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from lidar_perception.detectors.config_json import config_of
+from lidar_perception.detectors.config_json import parse_config
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import CLASSES, InputError
 
-KEY = "lidar_perception"  # of the metadata, whose values are strings
+KEY = "lidar_perception"  # of the header in the metadata, whose values are strings
 FORMAT = 1
-MOST = 100.0  # of a calibration's slopes and offsets
-HEIGHT_APART = 0.3  # m between mounts from which on a cloud looks another
-
+MAX_COEFFICIENT = 100.0  # of slopes and offsets of a calibration
+MIN_HEIGHT_DIFFERENCE_M = 0.3  # smaller differences in mounting height need no warning
 
 Net = TypeVar("Net", bound=torch.nn.Module)
 
 
 class Config(Protocol):
-    """What a network looks like, a dataclass. network: its name in NETWORKS."""
+    """Description of a network, a dataclass. `network` is its name in NETWORKS."""
 
     network: ClassVar[str]
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """The names of what it detects."""
+        """Names of the classes that it detects."""
 
     @property
     def title(self) -> str:
-        """Which one of its network it is."""
+        """Name of this variant of the network."""
 
 
 POINTPILLARS, POINTNET = NetworkConfig.network, PointNetConfig.network
-NETWORKS: dict[str, tuple[str, str, type[Config]]] = {  # what it is, where it is used, its config
+NETWORKS: dict[str, tuple[str, str, type[Config]]] = {  # title, use, and class of the config
     POINTPILLARS: ("PointPillars", "the node pointpillars_detector and pointpillars.weights",
                    NetworkConfig),
     POINTNET: ("PointNet", "the node pointnet_detector and pointnet.weights", PointNetConfig),
@@ -52,10 +51,15 @@ NETWORKS: dict[str, tuple[str, str, type[Config]]] = {  # what it is, where it i
 
 @dataclass(frozen=True)
 class Header:
-    """What is known about weights. config: of the network; training: data, steps, time, seed;
-    metrics: AP and the like, or empty; commit: of the code that trained them; calibration: what
-    makes scores probabilities, see calibration.py, empty where they are the network's own. All of
-    it can be JSON."""
+    """Metadata of a checkpoint. All values can be written as JSON.
+
+    Attributes:
+        config: description of the network.
+        training: data, steps, time and seed.
+        metrics: AP and other scores; may be empty.
+        commit: git commit of the training code.
+        calibration: see calibration.py; empty for raw scores.
+    """
 
     config: Any
     training: dict[str, Any] = field(default_factory=dict)
@@ -65,50 +69,58 @@ class Header:
 
     @property
     def network(self) -> str:
-        """Its name in NETWORKS."""
+        """Name of the network in NETWORKS."""
         return self.config.network
 
-    def unlike(self, height: float) -> str | None:
-        """What to say where weights are used with a sensor so many metres above the ground, and
-        that of their scans was elsewhere; None where that is not so, or nobody knows."""
+    def find_height_mismatch(self, height: float) -> str | None:
+        """Return a warning if the weights were trained for another sensor height than `height`
+        metres; None if they were not, or if the training height is unknown."""
         sensor = self.training.get("sensor")
         if not isinstance(sensor, dict) or not isinstance(sensor.get("height"), float) or (
-                abs(sensor["height"] - height) < HEIGHT_APART):
+                abs(sensor["height"] - height) < MIN_HEIGHT_DIFFERENCE_M):
             return None
         which = f"the sensor {sensor['name']}" if sensor.get("name") else "a sensor"
         return (f"trained for {which} at {sensor['height']:g} m, and used with one at {height:g} "
                 "m")
 
-    def text(self) -> str:
-        """As JSON."""
+    def to_json(self) -> str:
+        """Return the header as JSON text."""
         return json.dumps(dict(format=FORMAT, network=self.network,
                                config=dataclasses.asdict(self.config), training=self.training,
                                metrics=self.metrics, commit=self.commit,
                                calibration=self.calibration))
 
     @staticmethod
-    def of_text(text: str | None, source: str, kind: type[Config] | None = None) -> Header:
-        """The inverse of text. InputError naming source, also if its config is not of this
-        kind."""
-        content = _content(text, source)
+    def from_json(text: str | None, source: str, kind: type[Config] | None = None) -> Header:
+        """Read a header from JSON text, the inverse of to_json.
+
+        Args:
+            source: name of the file, for messages.
+            kind: expected class of the config; None: any.
+
+        Raises:
+            InputError: the text is not a header, or its config is of another class.
+        """
+        content = _parse_header(text, source)
         title, use, config = NETWORKS[content["network"]]
         if kind is not None and content["network"] != kind.network:
             wanted, own_use, _ = NETWORKS[kind.network]
             raise InputError(f"{source} holds a {title}, which is for {use}; {own_use} take a "
                              f"{wanted}")
-        return Header(config_of(config, content["config"], source), content["training"],
-                      content["metrics"], content["commit"], _lines(content["calibration"], source))
+        return Header(parse_config(config, content["config"], source), content["training"],
+                      content["metrics"], content["commit"],
+                      _parse_calibration(content["calibration"], source))
 
 
 PARTS = {"config": dict, "training": dict, "metrics": dict, "commit": str}
 
 
-def _content(text: str | None, source: str) -> dict[str, Any]:
-    """The header's parts, all there, of a network that is known."""
+def _parse_header(text: str | None, source: str) -> dict[str, Any]:
+    """Return the parts of a header. InputError if one is missing, or the network is unknown."""
     try:
         content = json.loads(text or "")
         parts = {name: content[name] for name in ("format", *PARTS)}
-        network = content.get("network", POINTPILLARS)  # the first files had no such key
+        network = content.get("network", POINTPILLARS)  # missing in early files
         calibration = content.get("calibration", {})
         if not all(isinstance(parts[name], kind) for name, kind in PARTS.items()):
             raise TypeError
@@ -124,38 +136,41 @@ def _content(text: str | None, source: str) -> dict[str, Any]:
     return {"network": network, "calibration": calibration, **parts}
 
 
-def _lines(content: Any, source: str) -> dict[str, tuple[float, float]]:
-    """The calibration of a header. InputError where it is none."""
+def _parse_calibration(content: Any, source: str) -> dict[str, tuple[float, float]]:
+    """Return the calibration of a header. InputError if it is invalid."""
     try:
         lines = {name: (float(slope), float(offset)) for name, (slope, offset) in content.items()}
-        if all(name in CLASSES and 0 < slope < MOST and abs(offset) < MOST
+        if all(name in CLASSES and 0 < slope < MAX_COEFFICIENT and abs(offset) < MAX_COEFFICIENT
                for name, (slope, offset) in lines.items()):
             return lines
     except (TypeError, ValueError, AttributeError, OverflowError):
         pass
-    raise InputError(f"{source} has a calibration that cannot be used; it needs a slope above 0 "
-                     "and an offset for each class")
+    raise InputError(f"{source} has an invalid calibration; it needs a slope above 0 and an offset "
+                     "for each class")
 
 
-def network_of(path: str | Path) -> str:
-    """Which network a checkpoint is of, a name of NETWORKS. InputError if it cannot be read."""
-    return _content(_read(Path(path), tensors=False)[0], str(path))["network"]
+def read_network_name(path: str | Path) -> str:
+    """Return the name of a checkpoint's network in NETWORKS. InputError if it cannot be read."""
+    return _parse_header(_read(Path(path), tensors=False)[0], str(path))["network"]
 
 
 def save_checkpoint(path: str | Path, network: torch.nn.Module, header: Header,
                     half: bool = False) -> None:
-    """Write the network's weights and header, so that path holds the old file or the whole new
-    one. half stores the weights of layers as float16; norms and biases stay float32."""
-    tensors = {name: _stored(value, half) for name, value in network.state_dict().items()}
-    write_bytes(path, save(tensors, {KEY: header.text()}))
+    """Write the weights and the header of a network atomically.
+
+    Args:
+        half: store the weights of layers as float16; norms and biases remain float32.
+    """
+    tensors = {name: _to_stored(value, half) for name, value in network.state_dict().items()}
+    write_bytes(path, save(tensors, {KEY: header.to_json()}))
 
 
 def save_header(path: Path, header: Header) -> None:
-    """Write another header into a checkpoint, whose tensors stay as they are stored."""
-    write_bytes(path, save(_read(path)[1], {KEY: header.text()}))
+    """Replace the header of a checkpoint and leave its tensors unchanged."""
+    write_bytes(path, save(_read(path)[1], {KEY: header.to_json()}))
 
 
-def _stored(value: torch.Tensor, half: bool) -> torch.Tensor:
+def _to_stored(value: torch.Tensor, half: bool) -> torch.Tensor:
     value = value.detach().cpu()
     if value.is_floating_point():
         value = value.to(torch.float16 if half and value.ndim > 1 else torch.float32)
@@ -163,29 +178,43 @@ def _stored(value: torch.Tensor, half: bool) -> torch.Tensor:
 
 
 def read_header(path: str | Path, kind: type[Config] | None = None) -> Header:
-    """The header alone. InputError for a file that is missing, broken or without one, or whose
-    config is not of this kind."""
-    return Header.of_text(_read(Path(path), tensors=False)[0], str(path), kind)
+    """Read the header of a checkpoint.
+
+    Args:
+        kind: expected class of the config; None: any.
+
+    Raises:
+        InputError: the file is missing or broken, has no header, or has a config of another class.
+    """
+    return Header.from_json(_read(Path(path), tensors=False)[0], str(path), kind)
 
 
-def read(path: str | Path, kind: type[Config]) -> tuple[Header, dict[str, torch.Tensor]]:
-    """Header, and the tensors as they are stored, on the CPU. InputError as read_header."""
+def read_checkpoint(path: str | Path,
+                    kind: type[Config]) -> tuple[Header, dict[str, torch.Tensor]]:
+    """Read the header and the tensors as stored, on the CPU. InputError as in read_header."""
     text, tensors = _read(Path(path))
-    return Header.of_text(text, str(path), kind), tensors
+    return Header.from_json(text, str(path), kind), tensors
 
 
-def load(path: str | Path, kind: type[Config], make: Callable[[Any], Net],
-         expected: Any = None) -> tuple[Header, Net]:
-    """Header, and the network that make(config) gives with the weights of the file: float32 on the
-    CPU, in training mode. InputError as read_header, where the weights do not fit, and where the
-    config is another than expected."""
-    header, tensors = read(path, kind)
+def load_checkpoint(path: str | Path, kind: type[Config], make: Callable[[Any], Net],
+                    expected: Any = None) -> tuple[Header, Net]:
+    """Load the header and the network of a checkpoint: float32, on the CPU, in training mode.
+
+    Args:
+        kind: class of the config.
+        make: make(config) returns the network without weights.
+        expected: config that the checkpoint must have; None: any.
+
+    Raises:
+        InputError: see read_header and require_same_config; or the weights do not fit the config.
+    """
+    header, tensors = read_checkpoint(path, kind)
     if expected is not None:
-        require_same(header.config, expected, str(path))
-    with torch.device("meta"):  # shapes alone: the header takes no memory before they fit
+        require_same_config(header.config, expected, str(path))
+    with torch.device("meta"):  # shapes only: allocate no memory before they are checked
         wanted = make(header.config).state_dict()
     for name in sorted({*wanted, *tensors}, key=str):
-        ours, theirs = (_described(state.get(name)) for state in (wanted, tensors))
+        ours, theirs = (_describe_tensor(state.get(name)) for state in (wanted, tensors))
         if ours != theirs:
             raise InputError(f"the weights in {path} do not fit its header: {name[:80]} is "
                              f"{theirs}, and should be {ours}")
@@ -195,52 +224,63 @@ def load(path: str | Path, kind: type[Config], make: Callable[[Any], Net],
     return header, network
 
 
-def _described(value: torch.Tensor | None) -> str:
+def _describe_tensor(value: torch.Tensor | None) -> str:
     if value is None:
-        return "not there"
+        return "missing"
     kind = "floats" if value.is_floating_point() else str(value.dtype).removeprefix("torch.")
     return f"{kind} of shape {tuple(value.shape)}"
 
 
-def adopt(network: torch.nn.Module, path: str | Path, kind: type[Config]) -> tuple[int, int]:
-    """Begin with the weights of a checkpoint of a network of this kind, of any config: each layer
-    of the same name and shape is taken, of one with other inputs those that both have (new ones
-    begin at 0); the rest stays as it is. How many tensors were taken, and of how many.
-    InputError as read, and where nothing fits."""
-    _, tensors = read(path, kind)
+def copy_matching_weights(network: torch.nn.Module, path: str | Path,
+                          kind: type[Config]) -> tuple[int, int]:
+    """Copy the weights of a checkpoint that fit a network, for fine-tuning; configs may differ.
+
+    Tensors with the same name and shape are copied. If only the number of inputs differs, the
+    common inputs are copied and new ones start at 0. All other tensors remain unchanged.
+
+    Args:
+        kind: class of the config.
+
+    Returns:
+        Number of copied tensors, and of all tensors of the network.
+
+    Raises:
+        InputError: see read_header; or no tensor fits.
+    """
+    _, tensors = read_checkpoint(path, kind)
     state = network.state_dict()
-    taken = 0
+    copied = 0
     for name, value in state.items():
-        found = tensors.get(name)
-        if found is None or found.ndim != value.ndim:
+        stored = tensors.get(name)
+        if stored is None or stored.ndim != value.ndim:
             continue
-        if found.shape == value.shape:
-            value.copy_(found)
-        elif value.ndim > 1 and found.shape[0] == value.shape[0] and (
-                found.shape[2:] == value.shape[2:]):
-            common = min(found.shape[1], value.shape[1])
+        if stored.shape == value.shape:
+            value.copy_(stored)
+        elif value.ndim > 1 and stored.shape[0] == value.shape[0] and (
+                stored.shape[2:] == value.shape[2:]):
+            common = min(stored.shape[1], value.shape[1])
             value.zero_()
-            value[:, :common] = found[:, :common]
+            value[:, :common] = stored[:, :common]
         else:
             continue
-        taken += 1
-    if not taken:
+        copied += 1
+    if not copied:
         raise InputError(f"no layer of {path} fits the network that is to be trained")
-    return taken, len(state)
+    return copied, len(state)
 
 
-def require_same(found: Any, wanted: Any, source: str) -> None:
-    """InputError naming the first fields in which two configs differ, with both values."""
+def require_same_config(found: Any, wanted: Any, source: str) -> None:
+    """Raise an InputError with the first fields in which two configs differ, and their values."""
     ours, theirs = dataclasses.asdict(wanted), dataclasses.asdict(found)
     different = [name for name in ours if ours[name] != theirs[name]]
     if different:
-        shown = "; ".join(f"{name} is {theirs[name]}, asked for was {ours[name]}"
+        shown = "; ".join(f"{name} is {theirs[name]}, expected was {ours[name]}"
                           for name in different[:3])
         raise InputError(f"{source} holds another network: {shown}")
 
 
 def _read(path: Path, tensors: bool = True) -> tuple[str | None, dict[str, torch.Tensor]]:
-    """The header's text, None if there is none, and the tensors."""
+    """Return the text of the header, None if there is none, and the tensors."""
     if not path.is_file():
         raise InputError(f"there is no checkpoint {path}")
     try:
@@ -249,4 +289,4 @@ def _read(path: Path, tensors: bool = True) -> tuple[str | None, dict[str, torch
             names = opened.keys() if tensors and text else ()
             return text, {name: opened.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
-        raise InputError(f"{path} is no checkpoint, or was cut short: {error}") from None
+        raise InputError(f"{path} is not a checkpoint, or is truncated: {error}") from None

@@ -1,7 +1,7 @@
-"""What a detector is: a frame in, a value out, and nothing to be read off it afterwards.
+"""The interface of all detectors: a function from a point cloud to a DetectionResult.
 
-PointPillars, PointNet, fused, exported networks and STM-CPA candidates all fulfil this; nodes,
-scores, training and scripts know nothing else of them.
+PointPillars, PointNet, the fused detector, exported networks and STM-CPA candidates implement it.
+Nodes, evaluation, training and scripts use nothing else.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lidar_perception.types import (
 )
 
 Cloud = PointCloud | ArrayLike  # see PointCloud.of
-FUSED = "fused"  # the default where one detector is wanted: all of them together
+FUSED = "fused"  # the default detector
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class DetectionResult:
     Attributes:
         detections: in the coordinates of the cloud, without the vehicle that carries the sensor.
         timings: milliseconds of each step (on CUDA after synchronisation).
-        problem: why nothing, or little, can be detected, with the remedy, or None.
+        problem: why nothing or little can be detected, with the remedy; None without a problem.
         best: highest score of each class if no score reached its threshold; otherwise empty.
     """
 
@@ -44,40 +44,45 @@ class DetectionResult:
 
 
 class Detector(Protocol):
-    """detector(cloud) -> DetectionResult. classes: names of types.CLASSES that it can detect."""
+    """An object detector: detector(cloud) returns a DetectionResult."""
 
     @property
-    def classes(self) -> tuple[str, ...]: ...
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes that it can detect, a subset of types.CLASSES."""
 
     @property
     def min_scores(self) -> Mapping[str, float]:
-        """By class, the least score of a detection."""
+        """Minimum score of a detection, by class."""
 
     def with_min_score(self, min_score: float) -> Self:
-        """The same detector with this least score for every class; this one stays as it is."""
+        """Return a copy of this detector with one threshold for all classes."""
 
     def with_sensor_height(self, height: float) -> Self:
-        """The same detector for a sensor so many metres above the ground; this one stays as it
-        is."""
+        """Return a copy of this detector for a sensor `height` metres above the ground."""
 
     def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> DetectionResult:
-        """Return the objects in a cloud of N points, N may be 0.
+        """Detect the objects in a cloud of N points; N may be 0.
 
         Args:
-            cloud: a PointCloud, or an array as PointCloud.of takes it: (N, 3) [x y z] or (N, 4)
+            cloud: a PointCloud, or an array that PointCloud.of accepts: (N, 3) [x y z] or (N, 4)
                 [x y z intensity], metres, x forward, y left, z up.
-            ground: (N,) bool from a stage before; computed where it is None and needed.
-            cluster_ids: (N,) int, 0 and below = none; computed where it is None and needed.
+            ground: (N,) bool from an earlier stage; None: computed if the detector needs it.
+            cluster_ids: (N,) int, 0 and below for no cluster; None: computed if needed.
 
         Raises:
-            InputError: columns of another length, and a cloud that cannot be used.
+            InputError: a column has the wrong length, or the cloud cannot be used.
         """
 
 
 class Accepted(NamedTuple):
-    """Checked arguments of a detector: the usable points of the cloud with the intensity in 0..1,
-    their columns, and the find_scale_problem() of the intensity."""
+    """Checked arguments of a detector.
+
+    Attributes:
+        frame: the usable points of the cloud, with the intensity in 0..1.
+        ground, cluster_ids: columns of these points.
+        problem: see find_scale_problem.
+    """
 
     frame: PointCloud
     ground: np.ndarray | None
@@ -87,11 +92,13 @@ class Accepted(NamedTuple):
 
 def accept(cloud: Cloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None,
            intensity_scale: float = 1.0) -> Accepted:
-    """Check and convert the arguments of a detector, see Detector.__call__. An intensity that is
-    not in 0..1 is divided by the scale that it seems to have, which is a guess from this cloud
-    alone, so that problem says it.
+    """Check and convert the arguments of a detector, see Detector.__call__.
 
-    intensity_scale: the factor by which the detector multiplies the intensity; 0: it reads none.
+    An intensity outside 0..1 is divided by the scale that it seems to have. This is a guess from
+    one cloud, so it is also reported as a problem.
+
+    Args:
+        intensity_scale: factor by which the detector multiplies the intensity; 0: it reads none.
     """
     frame = as_point_cloud(cloud)
     check_columns(len(frame), ground=ground, cluster_ids=cluster_ids)
@@ -110,9 +117,9 @@ def accept(cloud: Cloud, ground: np.ndarray | None, cluster_ids: np.ndarray | No
     return Accepted(frame, ground, cluster_ids, problem)
 
 
-def joined(*problems: str | None) -> str | None:
-    """Return the problems as one, in this order, without those that a later one repeats; None
-    without any."""
-    said = [problem for problem in problems if problem]
-    return "; ".join(problem for i, problem in enumerate(said)
-                     if not any(problem in later for later in said[i + 1:])) or None
+def join_problems(*problems: str | None) -> str | None:
+    """Join problems in this order, leaving out those that a later one contains; None if there are
+    no problems."""
+    found = [problem for problem in problems if problem]
+    return "; ".join(problem for i, problem in enumerate(found)
+                     if not any(problem in later for later in found[i + 1:])) or None

@@ -1,4 +1,4 @@
-"""Detectors of your own: any class whose instances return Detections for a cloud."""
+"""Custom detectors: any class whose instances return Detections for a cloud."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from lidar_perception.types import (
 
 ENTRY_POINTS = "lidar_perception.detectors"  # group of entry points: NAME = "module:Class"
 REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
-ARGUMENTS = "sensor_height", "device", "range"  # of a class, each passed on if the class takes it
+ARGUMENTS = "sensor_height", "device", "range"  # of a class, each passes on if the class takes it
 
 
 @dataclass(frozen=True)
 class MountParams(Params):
-    """Mounting of the sensor."""
+    """Mounting pose of the sensor."""
 
     sensor_pose: SensorPoseParams = SensorPoseParams()
 
@@ -49,12 +49,12 @@ class MountParams(Params):
 class CustomParams(Params):
     """Thresholds of the detections."""
 
-    scores: ScoreParams = ScoreParams.all_alike(0.0)
+    scores: ScoreParams = ScoreParams.for_all_classes(0.0)
 
 
 @dataclass(frozen=True)
 class CustomDetectorParams:
-    """All groups of a detector of your own. Settings of the class itself are not among them."""
+    """All parameter groups of a custom detector, without settings of the class itself."""
 
     crop: CropParams = CropParams()
     ground: MountParams = MountParams()
@@ -70,7 +70,7 @@ class CustomDetector:
         build: returns the function for a sensor height in metres.
         classes: names of the classes that it can detect.
         params: crop, mounting and, in the group `group`, the thresholds.
-        device: where it runs, for the status of a node.
+        device: shown in the status of a node.
     """
 
     name: str
@@ -88,7 +88,7 @@ class CustomDetector:
     @property
     def min_scores(self) -> Mapping[str, float]:
         """Minimum score of a detection, by class."""
-        return {name: self.scores.of_class(name) for name in self.classes}
+        return {name: self.scores.get(name) for name in self.classes}
 
     def with_params(self, params: Any) -> CustomDetector:
         """Return this detector with other parameters."""
@@ -96,7 +96,8 @@ class CustomDetector:
 
     def with_min_score(self, min_score: float) -> CustomDetector:
         """Return this detector with one threshold for all classes."""
-        own = replace(getattr(self.params, self.group), scores=ScoreParams.all_alike(min_score))
+        scores = ScoreParams.for_all_classes(min_score)
+        own = replace(getattr(self.params, self.group), scores=scores)
         return self.with_params(replace(self.params, **{self.group: own}))
 
     def with_sensor_height(self, height: float) -> CustomDetector:
@@ -124,11 +125,11 @@ class CustomDetector:
             raise RunError(f"{self.name} returned {type(found).__name__}; a detector returns "
                            "Detections, such as lidar_perception.Detections.of(boxes, class_ids, "
                            "scores)")
-        return DetectionResult(found[self.scores.passed(found)], {"detect": milliseconds}, problem)
+        return DetectionResult(found[self.scores.passes(found)], {"detect": milliseconds}, problem)
 
 
 def as_detector(detector: Detector | Callable[[PointCloud], Detections]) -> Detector:
-    """Return a detector as it is, and any other function of a cloud in an adapter.
+    """Return a Detector unchanged; wrap any other function of a cloud in an adapter.
 
     Raises:
         InputError: it cannot be called, or is a class instead of an instance.
@@ -157,11 +158,11 @@ def entry_point_names() -> list[str]:
 
 def load_custom_detector(reference: str, device: str = "auto", range: str = "auto",
                          params: Any = None, group: str = "custom") -> CustomDetector:
-    """Load the detector of a class, whose instances return Detections for a PointCloud.
+    """Load a custom detector, a class whose instances return Detections for a PointCloud.
 
     Args:
         reference: "module:Class". The module is on Python's path or in the current folder.
-        device, range: passed on if the class takes an argument of that name, as is the
+        device, range: passes on if the class takes an argument of that name, as is the
             sensor_height of the parameters, in metres.
         params, group: see CustomDetector. Default: CustomDetectorParams.
 

@@ -1,4 +1,4 @@
-"""Where a network runs, the CPU or CUDA, and in which number format."""
+"""Device and number format of a network."""
 
 from __future__ import annotations
 
@@ -11,8 +11,12 @@ CPU = torch.device("cpu")
 FORMATS = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 
-def chosen_device(name: str = "auto") -> torch.device:
-    """The torch device of 'auto', 'cpu', 'cuda' or 'cuda:N'. InputError if it is not there."""
+def find_device(name: str = "auto") -> torch.device:
+    """Return the torch device for 'auto', 'cpu', 'cuda' or 'cuda:N'.
+
+    Raises:
+        InputError: the name is unknown, or the machine has no such device.
+    """
     available = torch.cuda.is_available()
     if name == "auto":
         return torch.device("cuda" if available else "cpu")
@@ -24,15 +28,18 @@ def chosen_device(name: str = "auto") -> torch.device:
         raise InputError(f"there is no device {name!r}; choose auto, cpu, cuda or cuda:N") from None
     if device.type == "cuda" and not (available and (device.index or 0)
                                       < torch.cuda.device_count()):
-        raise InputError(f"device {name!r} is asked for but torch finds "
+        raise InputError(f"device {name!r} is not available: torch finds "
                          f"{torch.cuda.device_count() if available else 'no'} CUDA device here; "
                          "choose auto or cpu")
     return device
 
 
-def number_format(amp: str, device: torch.device) -> torch.dtype | None:
-    """The format of a network's layers, None for float32. auto: 16 bits where the device has
-    instructions for it; on the CPU fp16 is none."""
+def choose_dtype(amp: str, device: torch.device) -> torch.dtype | None:
+    """Return the dtype of a network's layers; None for float32.
+
+    Args:
+        amp: off, bf16, fp16 (CUDA only), or auto: 16 bits if the device has instructions for it.
+    """
     if device.type == "cpu":
         return FORMATS["bf16"] if amp == "bf16" or (amp == "auto" and has_bf16()) else None
     if amp == "off":

@@ -1,7 +1,7 @@
-"""Matrix products of rows that lie anywhere in memory, in the vectors of this processor.
+"""Matrix products of rows at arbitrary addresses, with the vector instructions of this processor.
 
-The kernel is written in LLVM IR, as neither NumPy's dot nor what Numba makes of loops is as fast on
-gathered rows. Callers find out from LANES whether there is one for this processor.
+The kernel is written in LLVM IR, because on gathered rows it is faster than NumPy's dot and than
+loops compiled by Numba. LANES is 0 if there is no kernel for this processor.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from numba.extending import intrinsic
 
 
 def _vector_width() -> int:
-    """Return the floats in a vector of the processor that Numba compiles for; 0 where it compiles
-    nothing, or the kernel is not tested."""
+    """Return the number of float32 in a vector register of this processor; 0 if Numba does not
+    compile, or if the kernel has not been tested on this kind of processor."""
     triple, _, features = cpu_target.target_context.codegen().magic_tuple()
     enabled = features.split(",")
     disabled = config.DISABLE_JIT  # type: ignore[attr-defined]  # numba sets it at run time
@@ -36,13 +36,13 @@ UNROLL = 4                       # channels in one turn of the inner loop
 
 @intrinsic
 def multiply_tile(typingctx, inputs, taps, channels, weights, starts, outputs, floor):
-    """Write a tile of ROWS x BLOCK sums: where they start, plus the products of inputs and weights.
+    """Write a tile of ROWS x BLOCK sums: start values plus products of inputs and weights.
 
-    All arguments but taps, channels and floor are addresses.
+    All arguments except taps, channels and floor are addresses.
 
     Args:
         inputs: (taps, ROWS) addresses of rows of float32.
-        channels: Number of values that are read in each, a multiple of UNROLL.
+        channels: Number of values per row, a multiple of UNROLL.
         weights: (taps, channels, BLOCK) float32.
         starts, outputs: (ROWS,) addresses of BLOCK float32 each, which may be the same.
         floor: Sums below it become floor; NaN stays NaN.
@@ -53,7 +53,7 @@ def multiply_tile(typingctx, inputs, taps, channels, weights, starts, outputs, f
 
 def _emit_tile(context: Any, builder: ir.IRBuilder, signature: Any, args: Sequence[ir.Value]
                ) -> Any:
-    """Emit multiply_tile, whose sums stay in registers over all taps and channels."""
+    """Emit multiply_tile. Its sums remain in registers over all taps and channels."""
     inputs, taps, channels, weights, starts, outputs, floor = args
     i64, f32 = ir.IntType(64), ir.FloatType()
     vector = ir.VectorType(f32, LANES)
@@ -153,7 +153,7 @@ def multiply(rows, weights, bias, floor):
 
 
 def packed(weights: np.ndarray) -> np.ndarray:
-    """Return weights (O, I, taps) in the order in which tiles read them, filled up with zeros:
+    """Return weights (O, I, taps) in the memory order of tiles, padded with zeros:
     (blocks, taps, channels, BLOCK) float32."""
     out, channels, taps = weights.shape
     blocks = -(-out // BLOCK)
@@ -163,12 +163,12 @@ def packed(weights: np.ndarray) -> np.ndarray:
 
 
 def padded(channels: int) -> int:
-    """Return the number of values that a row of `channels` values needs: a multiple of UNROLL."""
+    """Return `channels` rounded up to a multiple of UNROLL."""
     return -(-channels // UNROLL) * UNROLL
 
 
 def padded_bias(bias: np.ndarray | None, width: int) -> np.ndarray:
-    """Return a bias (O,) or None as (width,) float32, filled up with zeros."""
+    """Return a bias (O,) or None as (width,) float32, padded with zeros."""
     filled = np.zeros(width, np.float32)
     if bias is not None:
         filled[:len(bias)] = bias

@@ -1,5 +1,6 @@
-"""Exact non-maximum suppression of rotated boxes, on the CPU: for the few hundred boxes above the
-score threshold it is faster than a call to a GPU.
+"""Exact non-maximum suppression of rotated boxes.
+
+It runs on the CPU. For the few hundred boxes above the score threshold, a GPU would be slower.
 """
 
 from __future__ import annotations
@@ -56,10 +57,10 @@ def _is_kept(boxes, group, iou):
 
 @njit(cache=True, nogil=True)
 def keep_first(is_duplicate):
-    """Return which of N items are kept, (N,) bool.
+    """Return which of N items to keep, (N,) bool.
 
-    is_duplicate (N, N) bool: item j is dropped if is_duplicate[i, j] for an earlier item i that is
-    kept.
+    Args:
+        is_duplicate: (N, N) bool; item j is dropped if is_duplicate[i, j] for an earlier kept i.
     """
     kept = np.ones(len(is_duplicate), np.bool_)
     for i in range(len(is_duplicate)):

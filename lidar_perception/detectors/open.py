@@ -1,5 +1,5 @@
-"""Any detector of this package, by its name or from its weights. Importing this module loads no
-network: torch is loaded when a detector is opened."""
+"""Open a detector by its name or from a file of weights. Importing this module does not import
+torch; opening a detector does."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 POINTPILLARS, POINTNET = "pointpillars", "pointnet"
 
-# Function load(path, device) of each detector, in this folder. An empty path means the weights of
-# the package. A new detector is one line here; one with an entry in PARAMS, the parameters of its
-# node, gets them as a third argument.
+# The function load(path, device) of each detector, in this folder. An empty path means the shipped
+# weights. A new detector is one line here. If it has an entry in PARAMS, the parameters of its
+# node, its function gets them as a third argument.
 LOAD = {
     POINTPILLARS: "pointpillars.detector.load_detector",
     POINTNET: "pointnet.detector.load_pointnet_detector",
@@ -40,51 +40,51 @@ PARAMS = {
     POINTNET: "pointnet.params.PointNetDetectorParams",
     FUSED: "fused.params.FusedDetectorParams",
 }
-OTHER_FILES = {".onnx": POINTPILLARS, ".json": FUSED}  # files that are no checkpoints
+DETECTOR_BY_SUFFIX = {".onnx": POINTPILLARS, ".json": FUSED}  # of files that are not checkpoints
 
 
-class Configured(Detector, Protocol):
-    """A detector with a dataclass of parameters, those of its node."""
+class ConfigurableDetector(Detector, Protocol):
+    """A detector with the parameters of its node, a dataclass."""
 
     params: Any
 
     def with_params(self, params: Any) -> Self:
-        """Return this detector with other parameters; this one does not change."""
+        """Return a copy of this detector with other parameters."""
 
     def with_range(self, range: str) -> Self:
-        """Return this detector with another range, see base.NetworkDetector."""
+        """Return a copy of this detector with another range, see base.NetworkDetector."""
 
 
 @report_compilation(whole_detector=True)
 def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
                   sensor_height: float | None = None, min_score: float | None = None,
-                  range: str = "auto", settings: Mapping[str, Any] = {}) -> Configured:
+                  range: str = "auto", settings: Mapping[str, Any] = {}) -> ConfigurableDetector:
     """Open a detector by its name or from a file of weights.
 
     The first call on a machine compiles for a minute or two and reports it on standard error.
 
     Args:
-        weights: name of a detector (fused, pointpillars or pointnet), with the weights that come
-            with the package; or a file: a checkpoint (.safetensors), an exported network (.onnx)
-            or what `train fused` wrote (.json).
+        weights: name of a detector (fused, pointpillars or pointnet) with its shipped weights; or
+            a file: a checkpoint (.safetensors), an exported network (.onnx) or the output of
+            `train fused` (.json).
         device: auto, cpu, cuda or cuda:N.
-        sensor_height: height of the sensor above the ground in metres; None: that of KITTI.
+        sensor_height: height of the sensor above the ground in metres; None: 1.73 m, as in KITTI.
         min_score: threshold of every class, 0..1; None: the defaults.
         range: ahead, around, or auto, the range that the weights were trained for.
         settings: other parameters by their dotted names, such as {"fused.scores.car": 0.7}. They
             take precedence over the arguments above.
 
     Raises:
-        InputError: the file cannot be used, the detector cannot see that range, the device is not
-            there, or a parameter is unknown or out of range.
+        InputError: the file cannot be used, the detector cannot cover that range, the device does
+            not exist, or a parameter is unknown or out of range.
     """
     if range not in RANGE_CHOICES:
         raise unknown_name("range", range, RANGE_CHOICES)
-    kind, path = kind_and_file(weights)
+    kind, path = resolve_weights(weights)
     reference = None if kind in LOAD else find_reference(kind)
-    asked = {} if device == "auto" else {f"{kind}.device": device}
+    arguments = {} if device == "auto" else {f"{kind}.device": device}
     if range != "auto" and kind != POINTNET:
-        asked[f"{kind}.range"] = range
+        arguments[f"{kind}.range"] = range
     if path is not None and f"{kind}.weights" in settings:
         raise InputError(f"{kind}.weights is set, and {path} is given too; give one of them")
     try:
@@ -94,7 +94,7 @@ def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
             detector: Any = load_custom_detector(reference, device, range, custom)
         elif kind in PARAMS:
             own = settings.get("pointnet.weights") if kind == POINTNET else None
-            params = with_values(default_params(own or weights), {**asked, **settings})
+            params = with_values(default_params(own or weights), {**arguments, **settings})
             detector = _loader(kind)(path or "", getattr(params, kind).device, params)
         else:
             detector = _loader(kind)(path or "", device)
@@ -115,13 +115,13 @@ def default_params(weights: str | Path) -> Any:
     """Return the default parameters of a detector, a dataclass of groups.
 
     Args:
-        weights: name of a detector, or file of its weights. PointNet finds ground and clusters as
-            its weights were trained with.
+        weights: name of a detector, or file of its weights. The ground and clustering parameters of
+            PointNet are those that its weights were trained with.
 
     Raises:
         InputError: there is no such detector or file.
     """
-    kind, path = kind_and_file(weights)
+    kind, path = resolve_weights(weights)
     if kind not in LOAD:
         return CustomDetectorParams()
     if kind not in PARAMS:
@@ -130,7 +130,7 @@ def default_params(weights: str | Path) -> Any:
     return _as_trained(params, path) if kind == POINTNET else params
 
 
-def _loader(kind: str) -> Callable[..., Configured]:
+def _loader(kind: str) -> Callable[..., ConfigurableDetector]:
     return _attribute(LOAD[kind])
 
 
@@ -149,49 +149,52 @@ def _as_trained(params: Any, path: Path | None) -> Any:
     except InputError:
         if path is not None:
             raise
-        return params  # without weights there is nothing to open, which is said then
+        return params  # opening the detector will report the missing weights
     return replace(params, ground=config.ground, clustering=config.clustering)
 
 
-def kind_and_file(weights: str | Path) -> tuple[str, Path | None]:
-    """Return the name of a detector, and the file of its weights, None for those of the package and
-    for classes.
+def resolve_weights(weights: str | Path) -> tuple[str, Path | None]:
+    """Return the name of a detector and the file of its weights.
+
+    The file is None for shipped weights and for classes of your own.
 
     Raises:
-        InputError: `weights` is neither the name of a detector, a class, nor a file of weights.
+        InputError: `weights` is not a detector, a class or a file of weights.
     """
     name, path = str(weights), Path(weights)
     if name in LOAD or (not path.exists() and find_reference(name)):
         return name, None
     if path.name == name and not path.suffix and not path.exists():
         raise unknown_name("detector or file of weights", name, [*LOAD, *entry_point_names()])
-    return kind_of(path), path
+    return find_kind(path), path
 
 
-def kind_of(path: Path) -> str:
-    """The key in LOAD of a file of weights. InputError if it is none."""
-    if path.suffix in OTHER_FILES:
-        return OTHER_FILES[path.suffix]
-    from lidar_perception.detectors.checkpoint import network_of
-    return network_of(path)
+def find_kind(path: Path) -> str:
+    """Return the key in LOAD for a file of weights. InputError if it is not one."""
+    if path.suffix in DETECTOR_BY_SUFFIX:
+        return DETECTOR_BY_SUFFIX[path.suffix]
+    from lidar_perception.detectors.checkpoint import read_network_name
+    return read_network_name(path)
 
 
-def doubts(path: Path, height: float) -> list[str]:
-    """What to say of weights that are used with a sensor so many metres above the ground: that they
-    are for one at another height, that their scores are no probabilities, or that some of their
-    classes are never detected. Of an exported network nothing is known."""
-    if OTHER_FILES.get(path.suffix) == FUSED:
+def check_weights(path: Path, height: float) -> list[str]:
+    """Return warnings about a file of weights, for a sensor `height` metres above the ground.
+
+    Warnings are about another sensor height in training, scores that are not calibrated, and
+    classes that are never detected. Exported networks have no header and get none.
+    """
+    if DETECTOR_BY_SUFFIX.get(path.suffix) == FUSED:
         from lidar_perception.detectors.fused.fusion import read_fusion
         fusion = read_fusion(path)
-        known = _header(fusion.proposer)
-        return [*fusion.doubts(known.config.classes if known else ()),
-                *doubts(fusion.proposer, height), *doubts(fusion.classifier, height)]
-    known = _header(path)
-    other = known.unlike(height) if known else None
-    return [f"{path}: {other}"] if other else []
+        header = _read_header(fusion.proposer)
+        return [*fusion.find_warnings(header.config.classes if header else ()),
+                *check_weights(fusion.proposer, height), *check_weights(fusion.classifier, height)]
+    header = _read_header(path)
+    mismatch = header.find_height_mismatch(height) if header else None
+    return [f"{path}: {mismatch}"] if mismatch else []
 
 
-def _header(path: Path) -> Header | None:
+def _read_header(path: Path) -> Header | None:
     if path.suffix != ".safetensors":
         return None
     from lidar_perception.detectors.checkpoint import read_header
@@ -200,7 +203,7 @@ def _header(path: Path) -> Header | None:
 
 @dataclass(frozen=True)
 class DetectorChoice:
-    """A detector that is not opened yet: what open_detector takes."""
+    """Arguments of open_detector, for a detector that is opened later."""
 
     weights: str = FUSED
     range: str = "auto"
@@ -208,7 +211,7 @@ class DetectorChoice:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def open(self, *, sensor_height: float | None = None,
-             min_score: float | None = None) -> Configured:
+             min_score: float | None = None) -> ConfigurableDetector:
         """Open the detector, see open_detector."""
         return open_detector(self.weights, self.device, sensor_height=sensor_height,
                              min_score=min_score, range=self.range, settings=self.settings)

@@ -1,4 +1,4 @@
-"""Compiled code on several threads, as many as torch uses."""
+"""Compiled code on as many threads as torch uses."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from itertools import pairwise
 
 import torch
 
-PARTS_PER_THREAD = 4  # so that a thread that is held up leaves its work to the others
+PARTS_PER_THREAD = 4  # if one thread is delayed, the others take over its parts
 
 
-def in_parts(compute: Callable[[int, int], None], count: int, most: int) -> None:
-    """Call compute(begin, end) for parts that together are 0 .. count, on as many threads as torch
-    uses. compute must release the GIL to gain from it.
+def run_in_parts(compute: Callable[[int, int], None], count: int, max_parts: int) -> None:
+    """Call compute(begin, end) for ranges that cover 0 .. count, on as many threads as torch uses.
+    Only functions that release the GIL become faster.
 
     Args:
-        most: Number of parts that the work is worth.
+        max_parts: maximum number of ranges; small amounts of work need few.
     """
     threads = torch.get_num_threads()
-    parts = min(most, threads * PARTS_PER_THREAD, count)
+    parts = min(max_parts, threads * PARTS_PER_THREAD, count)
     if threads == 1 or parts < 2:
         compute(0, count)
         return
@@ -33,10 +33,10 @@ def in_parts(compute: Callable[[int, int], None], count: int, most: int) -> None
     helpers = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
     work()
     for helper in helpers:
-        if not helper.cancel():  # it has begun
+        if not helper.cancel():  # it has already started
             helper.result()
 
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, "in_parts")
+    return ThreadPoolExecutor(threads, "run_in_parts")

@@ -11,7 +11,7 @@ from typing import Any, Protocol, Self, TypeVar
 
 import torch
 
-from lidar_perception.detectors.calibration import raw_score
+from lidar_perception.detectors.calibration import to_raw_score
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.devices import CPU
 from lidar_perception.types import InputError
@@ -27,15 +27,18 @@ class Movable(Protocol):
 
 @dataclass
 class Placement:
-    """Where a network runs; fallback: why it runs on the CPU instead of the chosen device, or
-    None. All copies of a TrainedNetwork share it."""
+    """Device of a network, shared by all copies of a TrainedNetwork.
+
+    Attributes:
+        fallback: why the network runs on the CPU instead of the chosen device, or None.
+    """
 
     device: torch.device
     fallback: str | None = None
 
 
 class TrainedNetwork:
-    """Base class: a network in inference mode, the header of its weights, and its placement."""
+    """Base class of a network in inference mode, with the header of its weights and its device."""
 
     def __init__(self, network: Movable, header: Header, device: torch.device):
         self.network, self.header = network, header
@@ -65,9 +68,9 @@ class TrainedNetwork:
         return other
 
     def raw_scores(self, scores: Mapping[str, float]) -> list[float]:
-        """Return calibrated scores by class as the network's own scores, in the order of
+        """Convert calibrated scores by class to the network's own scores, in the order of
         `classes`."""
-        return [raw_score(name, scores[name], self.header.calibration) for name in self.classes]
+        return [to_raw_score(name, scores[name], self.header.calibration) for name in self.classes]
 
     def move(self, device: torch.device, cpu_fallback: bool = True) -> None:
         """Run on another device from now on, or on the CPU if the device is out of memory.
@@ -102,7 +105,7 @@ class TrainedNetwork:
         self.move(CPU)
 
     def now(self) -> float:
-        """Return a time in seconds, after all work queued on the device is done."""
+        """Return the time in seconds after all queued work of the device has finished."""
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         return perf_counter()
@@ -111,5 +114,5 @@ class TrainedNetwork:
         """Return the highest scores by class, for a cloud in which none reached its threshold, and
         the problem if one is NaN."""
         best = dict(zip(self.classes, scores))
-        return best, ("the network's scores are not numbers (NaN); the weights or the intensity "
-                      "are broken" if any(map(math.isnan, best.values())) else None)
+        return best, ("the network's scores are NaN; check the weights and the intensity"
+                      if any(map(math.isnan, best.values())) else None)

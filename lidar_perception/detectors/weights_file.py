@@ -1,4 +1,4 @@
-"""A checkpoint that a parameter names, found without loading torch."""
+"""Check of the file that a parameter names, without loading torch."""
 
 from __future__ import annotations
 
@@ -7,8 +7,12 @@ from pathlib import Path
 from lidar_perception.types import InputError
 
 
-def existing(path: str, parameter: str) -> Path:
-    """The file at path. InputError naming the parameter if there is none."""
+def require_weights(path: str, parameter: str) -> Path:
+    """Return the path of a file of weights.
+
+    Raises:
+        InputError: the file does not exist.
+    """
     if not Path(path).is_file():
-        raise InputError(f"there is no checkpoint {path}; name another with {parameter}")
+        raise InputError(f"there is no checkpoint {path}; set {parameter} to an existing file")
     return Path(path)

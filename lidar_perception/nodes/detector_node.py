@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from lidar_perception.detectors.contract import DetectionResult, joined
+from lidar_perception.detectors.contract import DetectionResult, join_problems
 from lidar_perception.detectors.params import NetworkParams
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import DetectionOutputs
@@ -70,13 +70,13 @@ class DetectorNode(ManagedNode):
         weights = self.weights()
         import torch  # takes seconds, so only after the weights are found
 
-        from lidar_perception.detectors.devices import chosen_device
+        from lidar_perception.detectors.devices import find_device
         # One thread is the default, by the environment that main.py sets.
         torch.set_num_threads(network_params.threads or count_cores())
         device = network_params.device
         if device.startswith("cuda") and network_params.cpu_fallback:
             try:
-                chosen_device(device)
+                find_device(device)
             except InputError as error:
                 device, fallback = "cpu", f"{error}; the CPU is used"
         with lock_compilation(self.get_logger().info):
@@ -94,7 +94,7 @@ class DetectorNode(ManagedNode):
                               cluster_ids=None if clusters is None else clusters[0])
             weak = result.detections
             if self.outputs.tracks is not None:
-                result = replace(result, detections=weak[network_params.scores.passed(weak)])
+                result = replace(result, detections=weak[network_params.scores.passes(weak)])
             tracking_problem = self.outputs.publish(msg.header, result.detections, result.timings,
                                                     frame.xyz, weak=weak)
         self._diagnose(frame, result, params, tracking_problem)
@@ -103,13 +103,13 @@ class DetectorNode(ManagedNode):
         """Return params with thresholds that include the weak detections for the tracker."""
         if self.outputs.tracks is None:
             return params
-        low = network_params.scores.at_most(self.node_params.tracking.min_score)
+        low = network_params.scores.with_maximum(self.node_params.tracking.min_score)
         return replace(params, **{self.group: replace(network_params, scores=low)})
 
     def _diagnose(self, frame: PointCloud, result: DetectionResult, params: Any,
                   tracking_problem: str | None) -> None:
         # The problem of the detector includes those of the intensity.
-        problem = joined(result.problem, self.sensor.check_height(
+        problem = join_problems(result.problem, self.sensor.check_height(
             frame, params.ground.sensor_pose), tracking_problem)
         self.counts.update(detections=len(result.detections), device=str(self.detector.device))
         self.counts["best scores"] = " ".join(

@@ -19,8 +19,8 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import NETWORKS, Header
 from lidar_perception.detectors.fused.detector import FusedDetector, Proposals, load_fused_detector
 from lidar_perception.detectors.fused.evidence import Evidence
-from lidar_perception.detectors.fused.fusion import KNOTS, Models, package_models, write_fusion
-from lidar_perception.detectors.fused.model import probabilities
+from lidar_perception.detectors.fused.fusion import KNOTS, Models, load_shipped_models, write_fusion
+from lidar_perception.detectors.fused.model import compute_probabilities
 from lidar_perception.detectors.fused.params import FusedDetectorParams, FusedParams
 from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.geometry import bev_iou, centre_distances
@@ -126,11 +126,11 @@ def fit_fusion(weights: Path | None, classifier: Path | None, out: Path, params:
     errors.print(f"{params.scans} {params.scene} scans of {params.sensor} at {sensor.height:g} m, "
                  f"{'all around' if around else 'ahead'}")
     for network in header, other:
-        if warning := network.unlike(sensor.height):
+        if warning := network.find_height_mismatch(sensor.height):
             errors.print(f"{NETWORKS[network.network][0]}: {warning}")
     source = SimulatedScenes(FIRST_FITTED_SCENE, params.scans, sensor, scenes, around=around)
     models, fits = fit_classes(simulate_samples(FusedDetectorParams(fused=own), source, jobs),
-                               package_models())
+                               load_shipped_models())
     write_fusion(out, (weights, classifier), models, {
         "sensor": params.sensor, "height": sensor.height, "scene": params.scene,
         "scans": params.scans, "range": "around" if around else "ahead",
@@ -238,7 +238,8 @@ def fit_classes(samples: Samples, before: Models) -> tuple[Models, dict[str, Cla
             models[name] = fit_class(name, own)
             after = _cross_validate(name, own)
         fits[name] = ClassFit(len(own.right), int(own.right.sum()),
-                              _score(own, probabilities(before, own.class_ids, own.evidence)),
+                              _score(own, compute_probabilities(before, own.class_ids,
+                                                                own.evidence)),
                               after)
     return models, fits
 
@@ -264,7 +265,7 @@ def _cross_validate(name: str, own: Samples) -> CurveScore:
         in_half = own.scans % 2 == half
         model = {name: fit_class(name, own.take(~in_half))}
         left_out = own.take(in_half)
-        scores[in_half] = probabilities(model, left_out.class_ids, left_out.evidence)
+        scores[in_half] = compute_probabilities(model, left_out.class_ids, left_out.evidence)
     return _score(own, scores)
 
 
@@ -272,6 +273,6 @@ def _score(own: Samples, scores: np.ndarray) -> CurveScore:
     if not len(scores):
         return CurveScore(0.0, 0, 0)
     likelihood = np.where(own.right, scores, 1 - scores)
-    passed = scores >= ScoreParams().of_class(CLASSES[own.class_ids[0]])
+    passed = scores >= ScoreParams().get(CLASSES[own.class_ids[0]])
     return CurveScore(float(-np.log(np.maximum(likelihood, MIN_PROBABILITY)).mean()),
                       int((passed & own.right).sum()), int((passed & ~own.right).sum()))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from lidar_perception.detectors.params import seen_range
+from lidar_perception.detectors.params import make_range_param
 from lidar_perception.param_fields import Params, flatten, param
 
 # A resumed run may change these.
@@ -237,4 +237,4 @@ class FusedTraining(Params):
                                "number.", low=0.0, high=100.0)
     mount_height: float = param(0.0, "Height of the sensor above the ground. 0: as for the "
                                 "training of the weights.", unit="m", low=0.0, high=10.0)
-    range: str = seen_range()
+    range: str = make_range_param()

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from lidar_perception.detectors.checkpoint import HEIGHT_APART
+from lidar_perception.detectors.checkpoint import MIN_HEIGHT_DIFFERENCE_M
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.machine import count_cores
 from lidar_perception.runs.terminal import errors, format_duration
@@ -162,7 +162,7 @@ def has_simulated(sources: Sequence[Any]) -> bool:
 def find_recorded_height(sources: Sequence[Any]) -> float | None:
     """Return the sensor height of the recordings in metres, None without any or if they differ."""
     heights = [source.sensor_height for source in sources if isinstance(source, RecordedScenes)]
-    if not heights or max(heights) - min(heights) >= HEIGHT_APART:
+    if not heights or max(heights) - min(heights) >= MIN_HEIGHT_DIFFERENCE_M:
         return None
     return round(median(heights), 2)
 

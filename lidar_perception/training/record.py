@@ -11,7 +11,13 @@ import numpy as np
 from torch import nn
 
 from lidar_perception import __version__
-from lidar_perception.detectors.checkpoint import Config, Header, Net, adopt, save_checkpoint
+from lidar_perception.detectors.checkpoint import (
+    Config,
+    Header,
+    Net,
+    copy_matching_weights,
+    save_checkpoint,
+)
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.terminal import errors
 from lidar_perception.scoring.kitti.protocol import Comparison
@@ -55,7 +61,7 @@ def make_save(out: Path, config: Any, params: LoopParams, batches: Batches,
 def load_initial_weights(network: Net, init: Path | None, kind: type[Config]) -> Net:
     """Load the tensors of a checkpoint that fit the network, and report how many do."""
     if init is not None:
-        taken, count = adopt(network, init, kind)
+        taken, count = copy_matching_weights(network, init, kind)
         if taken < count:
             errors.print(f"{taken} of {count} tensors are from {init}, the others begin at random")
     return network

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from lidar_perception.detectors.checkpoint import Net
-from lidar_perception.detectors.devices import number_format
+from lidar_perception.detectors.devices import choose_dtype
 from lidar_perception.training.distributed import get_world_size, is_true_anywhere
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.schedule import WeightAverage, compute_one_cycle
@@ -94,7 +94,7 @@ class Run:
                 self.module, device_ids=[device] if device.type == "cuda" else None)
         self.optimizer = torch.optim.AdamW(self.module.parameters(), lr=params.lr,
                                            weight_decay=params.weight_decay)
-        self.format = number_format(params.amp, device)
+        self.format = choose_dtype(params.amp, device)
         self.scaler = torch.amp.GradScaler(device.type, enabled=self.format is torch.float16)
         self.progress = Progress()
 

@@ -11,8 +11,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lidar_perception.detectors.checkpoint import network_of
-from lidar_perception.detectors.devices import chosen_device
+from lidar_perception.detectors.checkpoint import read_network_name
+from lidar_perception.detectors.devices import find_device
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.files import make_folder
 from lidar_perception.runs.resuming import hash_names
@@ -82,7 +82,7 @@ def start_training(trainer: Trainer, request: TrainingRequest, params: Any,
     hours = request.budget if steps_given else request.budget or DEFAULT_BUDGET_H
     sensor = find_sensor(params.sensor, params.mount_height)
     settings = _collect_settings(request, params, sensor, init)
-    with join_process_group(chosen_device(request.device)) as device, directory.lock():
+    with join_process_group(find_device(request.device)) as device, directory.lock():
         wait_for_all()  # until every process has looked at the files that rank 0 writes
         planner = Planner(trainer, request, params, sensor, device)
         if get_rank() == 0:
@@ -122,7 +122,7 @@ def _check_request(request: TrainingRequest, directory: RunDirectory, init: Path
     if request.budget is not None and not 0 < request.budget < math.inf:
         raise InputError(f"--budget {request.budget:g} must be a number of hours above 0")
     if init is not None:
-        network_of(init)
+        read_network_name(init)
     directory.require_no_run(request.resume)
 
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import torch
 from torch import nn
 
-from lidar_perception.detectors.devices import number_format
+from lidar_perception.detectors.devices import choose_dtype
 from lidar_perception.runs.machine import count_cores
 from lidar_perception.training.data import Item, SceneReader
 from lidar_perception.training.params import LoopParams
@@ -87,7 +87,7 @@ def measure_step(module: nn.Module, loss: Callable, prepare: Callable[[], Sequen
     prepare()  # compiles kernels
     preparation, samples = measure_duration(prepare)
     batch = [samples[i % len(samples)] for i in range(params.batch)]
-    amp = number_format(params.amp, device)
+    amp = choose_dtype(params.amp, device)
 
     def step() -> None:  # in this process only, even if several train together
         with torch.autocast(device.type, amp) if amp else nullcontext():

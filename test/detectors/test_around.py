@@ -101,7 +101,7 @@ def test_what_cannot_see_that_says_so():
     config = pointnet_samples.small()
     pointnet = PointNetDetector(PointNetClassifier(pointnet_samples.lively(config), Header(config)))
     assert pointnet.with_range("around") is pointnet
-    with pytest.raises(InputError, match="pointnet sees all around; leave out"):
+    with pytest.raises(InputError, match="pointnet always covers all directions"):
         pointnet.with_range("ahead")
     with pytest.raises(InputError, match="cannot see around: a grid of"):
         random_detector(low=(0.0, -3.52, -3.0), high=(7.04, 3.52, 1.0),

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from pointnet_samples import random_detector as random_pointnet
 from samples import object_folder
 
-from lidar_perception.detectors.calibration import calibrated, raw_score
+from lidar_perception.detectors.calibration import calibrate_scores, to_raw_score
 from lidar_perception.detectors.checkpoint import (
     Header,
-    read,
+    read_checkpoint,
     read_header,
     save_checkpoint,
     save_header,
@@ -35,17 +35,17 @@ def test_the_order_stays_and_a_threshold_is_found_again(scores, slope, offset):
     lines = {"Car": (slope, offset)}
     scores = np.sort(np.array(scores, np.float32))
     found = Detections.of(np.ones((len(scores), 7)), CLASSES.index("Car"), scores)
-    after = calibrated(found, lines).scores
+    after = calibrate_scores(found, lines).scores
     assert (np.diff(after) >= 0).all() and after.dtype == np.float32
     assert ((after >= 0) & (after <= 1)).all()
     others = Detections.of(found.boxes, CLASSES.index("Cyclist"), scores)
-    np.testing.assert_array_equal(calibrated(others, lines).scores, scores)
+    np.testing.assert_array_equal(calibrate_scores(others, lines).scores, scores)
     for score in (0.0, 0.01, 0.3, 0.97, 1.0):
-        raw = raw_score("Car", score, lines)
+        raw = to_raw_score("Car", score, lines)
         assert 0 <= raw <= 1
         if 1e-6 < raw < 1 - 1e-6:
             beside = np.nextafter(np.float32(raw), np.float32([0, 1]))  # scores are float32
-            low, high = calibrated(Detections.of(np.ones((2, 7)), 0, beside), lines).scores
+            low, high = calibrate_scores(Detections.of(np.ones((2, 7)), 0, beside), lines).scores
             assert low - 1e-6 <= score <= high + 1e-6
 
 
@@ -57,7 +57,7 @@ def test_a_detector_finds_the_same_boxes_and_its_threshold_is_a_probability(make
     (network,) = detector.networks
     network.header = replace(network.header, calibration=LINES)
     found = detector(scan).detections
-    assert len(found) and same(found, calibrated(plain, LINES), atol=1e-6)
+    assert len(found) and same(found, calibrate_scores(plain, LINES), atol=1e-6)
     assert same(detector.with_raw_scores()(scan), plain)
     middle = float(np.median(found.scores))
     # What is weak suppresses nothing that is strong, so a threshold takes the weak away alone.
@@ -73,7 +73,7 @@ def test_a_detector_finds_the_same_boxes_and_its_threshold_is_a_probability(make
 def test_lines_that_do_not_rise_are_refused(tmp_path, broken):
     header = Header(tiny("v0"), calibration=broken)
     save_checkpoint(tmp_path / "w.safetensors", lively(tiny("v0")), header)
-    with pytest.raises(InputError, match="calibration that cannot be used"):
+    with pytest.raises(InputError, match="invalid calibration"):
         read_header(tmp_path / "w.safetensors")
 
 
@@ -81,9 +81,9 @@ def test_lines_that_do_not_rise_are_refused(tmp_path, broken):
 def test_another_calibration_leaves_the_weights_as_they_are_stored(tmp_path, half):
     path, config = tmp_path / "some.safetensors", tiny()
     save_checkpoint(path, lively(config), Header(config, calibration=LINES), half)
-    _, before = read(path, type(config))
+    _, before = read_checkpoint(path, type(config))
     save_header(path, Header(config, calibration={"Car": (1.0, 0.0)}))
-    header, after = read(path, type(config))
+    header, after = read_checkpoint(path, type(config))
     assert header.calibration == {"Car": (1.0, 0.0)} and after.keys() == before.keys()
     assert all(value.dtype == before[name].dtype and value.equal(before[name])
                for name, value in after.items())

@@ -82,7 +82,7 @@ def test_a_mutated_header_is_used_or_refused_with_one_line(kind, tmp_path):
     make_header, make, load, params = SMALL[kind]
     header = make_header()
     tensors = make(header.config).state_dict()
-    path, text, rng = tmp_path / "w.safetensors", json.loads(header.text()), random.Random(7)
+    path, text, rng = tmp_path / "w.safetensors", json.loads(header.to_json()), random.Random(7)
     scan, refused = frame(), 0
     texts = [json.dumps(mutated(text, rng)) for _ in range(60)]
     texts += ["[" * 100_000, '{"format":' * 50_000, "1" * 5000, "", "null", "\ud83d".encode(
@@ -100,7 +100,7 @@ def test_a_mutated_header_is_used_or_refused_with_one_line(kind, tmp_path):
 
 
 def test_a_header_takes_no_memory_before_the_tensors_fit_it(tmp_path):
-    header = json.loads(SMALL["pointpillars"][0]().text())
+    header = json.loads(SMALL["pointpillars"][0]().to_json())
     header["config"]["block_channels"] = [65_536, 65_536, 65_536]  # 300 GB of weights
     path = tmp_path / "w.safetensors"
     write(path, lively(tiny("v4")).state_dict(), json.dumps(header))
@@ -128,7 +128,7 @@ def test_onnx_files_with_other_inputs_are_refused(tmp_path):
     onnx = pytest.importorskip("onnx", reason="needs the extra [onnx]")
     pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
     from onnx import TensorProto, helper
-    text = Header(tiny("v0")).text()
+    text = Header(tiny("v0")).to_json()
 
     def model(path, inputs, outputs=("logits", "codes", "directions"), header=text):
         nodes = [helper.make_node("Constant", [], [name], value=helper.make_tensor(
@@ -164,10 +164,11 @@ def test_tensors_of_other_types_are_refused(tmp_path):
     config = tiny("v4")
     path, state = tmp_path / "w.safetensors", lively(config).state_dict()
     for dtype in torch.bool, torch.int8, torch.complex64:
-        write(path, {name: value.to(dtype) for name, value in state.items()}, Header(config).text())
+        write(path, {name: value.to(dtype) for name, value in state.items()},
+              Header(config).to_json())
         with pytest.raises(InputError, match="should be floats of shape"):
             load_detector(path, "cpu", eager())
     write(path, {name: value.double() if value.is_floating_point() else value
-                 for name, value in state.items()}, Header(config).text())
+                 for name, value in state.items()}, Header(config).to_json())
     expected = make_detector(TorchNetwork(lively(config)), Header(config), eager())
     assert same(load_detector(path, "cpu", eager(engine="torch"))(frame()), expected(frame()))

@@ -9,7 +9,7 @@ import pytest
 from samples import scene
 
 from lidar_perception.detectors import custom
-from lidar_perception.detectors.open import default_params, kind_and_file, open_detector
+from lidar_perception.detectors.open import default_params, open_detector, resolve_weights
 from lidar_perception.scoring.comparison.contenders import _name
 from lidar_perception.types import Detections, InputError, RunError
 
@@ -109,7 +109,7 @@ def test_wrong_return_type_ends_the_run(module):
 def test_entry_point_names_a_class(module, monkeypatch):
     points = [EntryPoint("mine", f"{module}:Fixed", custom.ENTRY_POINTS)]
     monkeypatch.setattr(custom, "entry_points", lambda group: points)
-    assert kind_and_file("mine") == ("mine", None)
+    assert resolve_weights("mine") == ("mine", None)
     assert len(open_detector("mine")(scene(0)).detections) == 2
     assert default_params("mine") == custom.CustomDetectorParams()
     with pytest.raises(InputError, match=r"Valid names: .*, mine"):

@@ -11,8 +11,8 @@ from detection_samples import BOXES, LABELS, lively, tiny, two_objects
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidar_perception.detectors.checkpoint import require_same
-from lidar_perception.detectors.config_json import config_of
+from lidar_perception.detectors.checkpoint import require_same_config
+from lidar_perception.detectors.config_json import parse_config
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.box_coder import decode
 from lidar_perception.detectors.pointpillars.config import (
@@ -60,7 +60,7 @@ def some_map(config, seed=0) -> torch.Tensor | None:
 @pytest.mark.parametrize("size", SIZES)
 def test_a_config_survives_json(version, size):
     config = network_config(version, size, classes=("Cyclist", "Car"))
-    assert config_of(NetworkConfig, dataclasses.asdict(config), "") == config
+    assert parse_config(NetworkConfig, dataclasses.asdict(config), "") == config
     assert config.classes == ("Cyclist", "Car") and config.grid == (496, 432)
 
 
@@ -92,8 +92,8 @@ def test_a_config_that_cannot_be_is_refused(change, words):
 
 
 def test_another_network_is_refused_with_both_values():
-    with pytest.raises(InputError, match=r"f\.st .*version is v4, asked for was v2"):
-        require_same(network_config("v4"), network_config("v2"), "f.st")
+    with pytest.raises(InputError, match=r"f\.st .*version is v4, expected was v2"):
+        require_same_config(network_config("v4"), network_config("v2"), "f.st")
 
 
 # pillars

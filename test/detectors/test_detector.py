@@ -13,7 +13,7 @@ from lidar_perception.clustering.cluster import cluster
 from lidar_perception.clustering.density import measure_density
 from lidar_perception.clustering.shapes import classify_by_diagonal, fit_boxes, fit_ellipses
 from lidar_perception.detectors.checkpoint import Header
-from lidar_perception.detectors.devices import CPU, chosen_device
+from lidar_perception.detectors.devices import CPU, find_device
 from lidar_perception.detectors.normalized_view import NormalizedView, to_sensor_frame
 from lidar_perception.detectors.pointpillars import proposer as proposer_module
 from lidar_perception.detectors.pointpillars.config import VERSIONS, network_config
@@ -267,9 +267,9 @@ def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(monkeypatch
                                          ("cuda:99", "CUDA device")])
 def test_a_device_that_is_not_there_is_refused(name, words):
     with pytest.raises(InputError, match=words):
-        chosen_device(name)
-    assert chosen_device("cpu") == CPU
-    assert chosen_device().type == ("cuda" if torch.cuda.is_available() else "cpu")
+        find_device(name)
+    assert find_device("cpu") == CPU
+    assert find_device().type == ("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def test_real_scans_of_any_version_go_through(data):

@@ -17,19 +17,19 @@ from pointnet_samples import random_detector as random_classifier
 from lidar_perception.classes import CAR
 from lidar_perception.detectors.boxes import (
     FRONT,
-    MARGIN,
+    MARGIN_M,
     SIDE,
-    cars_on_points,
-    moved_towards,
-    on_ground,
-    on_points,
+    move_cars_to_points,
+    move_to_ground,
+    move_to_points,
+    move_towards,
 )
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.fused.detector import FusedDetector, remove_duplicates
-from lidar_perception.detectors.fused.evidence import LEAST, clipped_logit
-from lidar_perception.detectors.fused.fusion import KNOTS, package_models
-from lidar_perception.detectors.fused.model import probabilities
+from lidar_perception.detectors.fused.evidence import MIN_PROBABILITY, to_log_odds
+from lidar_perception.detectors.fused.fusion import KNOTS, load_shipped_models
+from lidar_perception.detectors.fused.model import compute_probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.normalized_view import drop_ego_vehicle
 from lidar_perception.detectors.pointnet import classifier
@@ -105,26 +105,27 @@ def test_a_car_that_is_off_comes_to_its_points_and_one_that_is_right_stays(seed)
     points = shell(box, rng)
     off = box.copy()
     off[:2] += rng.uniform(-0.2, 0.2, 2)
-    both = on_points(np.stack([box, off]), points, 1.0)
+    both = move_to_points(np.stack([box, off]), points, 1.0)
     np.testing.assert_allclose(both, [box, box], atol=0.02)
-    half = on_points(off[None], points, 0.5)[0]
+    half = move_to_points(off[None], points, 0.5)[0]
     np.testing.assert_allclose(half, (off + box) / 2, atol=0.02)
-    np.testing.assert_array_equal(on_points(off[None], points, 0.0)[0], off)
-    np.testing.assert_array_equal(on_points(off[None], points[:0], 1.0)[0], off)
-    cars = cars_on_points(np.stack([off, off]), np.array([CAR, PEDESTRIAN]), points, 1.0)
-    np.testing.assert_array_equal(cars, [on_points(off[None], points, 1.0)[0], off])
+    np.testing.assert_array_equal(move_to_points(off[None], points, 0.0)[0], off)
+    np.testing.assert_array_equal(move_to_points(off[None], points[:0], 1.0)[0], off)
+    cars = move_cars_to_points(np.stack([off, off]), np.array([CAR, PEDESTRIAN]), points, 1.0)
+    np.testing.assert_array_equal(cars, [move_to_points(off[None], points, 1.0)[0], off])
     # Never farther than the margin, however far the points are.
-    assert np.hypot(*(on_points(off[None], points + [0.3, 0, 0], 1.0) - off)[0, :2]) <= 2 * MARGIN
+    moved = move_to_points(off[None], points + [0.3, 0, 0], 1.0)
+    assert np.hypot(*(moved - off)[0, :2]) <= 2 * MARGIN_M
 
 
 def test_boxes_stand_on_the_ground_where_it_is_known():
     boxes = random_boxes(np.random.default_rng(0), 20)
     floors = np.where(np.arange(20) % 4, boxes[:, 2] - 1, np.nan)
-    on = on_ground(boxes, floors, 1.0)
+    on = move_to_ground(boxes, floors, 1.0)
     known = np.isfinite(floors)
     np.testing.assert_allclose((on[:, 2] - on[:, 5] / 2)[known], floors[known])
     np.testing.assert_array_equal(on[~known], boxes[~known])
-    np.testing.assert_array_equal(on_ground(boxes, floors, 0.0), boxes)
+    np.testing.assert_array_equal(move_to_ground(boxes, floors, 0.0), boxes)
 
 
 @given(SEEDS)
@@ -133,7 +134,7 @@ def test_a_box_moves_towards_another_of_the_same_object_and_keeps_its_front(seed
     boxes, others = random_boxes(rng, 20), random_boxes(rng, 20)
     silent = rng.random(20) < 0.3
     others[silent] = np.nan
-    there, half, none = (moved_towards(boxes, others, share) for share in (1.0, 0.5, 0.0))
+    there, half, none = (move_towards(boxes, others, share) for share in (1.0, 0.5, 0.0))
     np.testing.assert_allclose(none[:, :6], boxes[:, :6])
     np.testing.assert_allclose(wrap_angle(none[:, 6] - boxes[:, 6]), 0, atol=1e-9)
     np.testing.assert_array_equal(half[silent], none[silent])
@@ -149,19 +150,20 @@ def test_a_box_moves_towards_another_of_the_same_object_and_keeps_its_front(seed
 @given(SEEDS)
 def test_more_evidence_is_never_less_likely_and_silence_is_neither(seed):
     rng = np.random.default_rng(seed)
-    class_ids = rng.choice([CLASSES.index(name) for name in package_models()], 50)
-    evidence = {source: clipped_logit(rng.uniform(0, 1, 50)) for source in KNOTS}
-    before = probabilities(package_models(), class_ids, evidence)
+    class_ids = rng.choice([CLASSES.index(name) for name in load_shipped_models()], 50)
+    evidence = {source: to_log_odds(rng.uniform(0, 1, 50)) for source in KNOTS}
+    models = load_shipped_models()
+    before = compute_probabilities(models, class_ids, evidence)
     assert ((before >= 0) & (before <= 1)).all() and before.dtype == np.float32
     for source in KNOTS:
         more = {**evidence, source: evidence[source] + rng.uniform(0, 3, 50)}
-        assert (probabilities(package_models(), class_ids, more) >= before - 1e-6).all()
+        assert (compute_probabilities(models, class_ids, more) >= before - 1e-6).all()
         silent = {**evidence, source: np.full(50, np.nan)}
-        assert np.isfinite(probabilities(package_models(), class_ids, silent)).all()
+        assert np.isfinite(compute_probabilities(load_shipped_models(), class_ids, silent)).all()
     unknown = np.full(50, CLASSES.index("Tram"))
-    assert not probabilities(package_models(), unknown, evidence).any()
-    least = clipped_logit(LEAST)
-    np.testing.assert_allclose(clipped_logit([0, 0.5, 1]), [least, 0, -least], atol=1e-9)
+    assert not compute_probabilities(load_shipped_models(), unknown, evidence).any()
+    least = to_log_odds(MIN_PROBABILITY)
+    np.testing.assert_allclose(to_log_odds([0, 0.5, 1]), [least, 0, -least], atol=1e-9)
 
 
 def test_people_at_one_place_are_one_and_cars_do_not_share_any():

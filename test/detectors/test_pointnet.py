@@ -9,7 +9,7 @@ import pytest
 import torch
 from pointnet_samples import blobs
 
-from lidar_perception.detectors.config_json import config_of
+from lidar_perception.detectors.config_json import parse_config
 from lidar_perception.detectors.pointnet import config as config_module
 from lidar_perception.detectors.pointnet.box_head import BoxTargets, cluster_loss, decode, encode
 from lidar_perception.detectors.pointnet.calibration import calibrate, calibration_error
@@ -215,7 +215,7 @@ def test_every_switch_of_the_ablation_changes_the_network_or_the_clusters():
 
 def test_a_config_survives_json_and_what_cannot_be_is_said():
     config = pointnet_config("pointnet2", points=64)
-    assert config_of(config_module.PointNetConfig, asdict(config), "") == config
+    assert parse_config(config_module.PointNetConfig, asdict(config), "") == config
     with pytest.raises(InputError, match="no network 'resnet'"):
         pointnet_config("resnet")
     with pytest.raises(InputError, match="Bus"):
@@ -223,7 +223,7 @@ def test_a_config_survives_json_and_what_cannot_be_is_said():
     with pytest.raises(InputError, match="length"):
         pointnet_config(classes=("Car",))
     with pytest.raises(InputError, match="later version"):
-        config_of(config_module.PointNetConfig, {"wings": 2}, "")
+        parse_config(config_module.PointNetConfig, {"wings": 2}, "")
     for wrong in dict(radii=(0.4, 0.2, 0.1)), dict(centroids=500), dict(neighbours=(1, 2)):
         with pytest.raises(InputError):
             pointnet_config(**wrong)

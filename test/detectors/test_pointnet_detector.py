@@ -19,7 +19,12 @@ from samples import object_folder
 
 from lidar_perception.cli.main import cli
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.detectors.checkpoint import Header, network_of, read_header, save_checkpoint
+from lidar_perception.detectors.checkpoint import (
+    Header,
+    read_header,
+    read_network_name,
+    save_checkpoint,
+)
 from lidar_perception.detectors.checkpoint import Header as PointPillarsHeader
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.normalized_view import to_sensor_frame
@@ -290,7 +295,7 @@ def with_header(path, out, **changes):
 
 def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
     path, other, header = saved
-    assert read_header(path) == header and network_of(path) == "pointnet"
+    assert read_header(path) == header and read_network_name(path) == "pointnet"
     loaded_header, loaded = load_pointnet(path, header.config)
     assert loaded_header == header
     for name, value in lively(header.config).state_dict().items():
@@ -300,7 +305,7 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
     detector = load_pointnet_detector(path, "cpu", eager())
     assert same(detector(frame()), random_detector()(frame()))
     first = with_header(other, tmp_path / "first.safetensors", network=None)  # had no such key
-    assert network_of(other) == network_of(first) == "pointpillars"
+    assert read_network_name(other) == read_network_name(first) == "pointpillars"
     assert load_network(first)[0] == load_network(other)[0]
 
 
@@ -311,13 +316,13 @@ def test_weights_of_another_network_or_other_classes_are_refused(saved, tmp_path
     with pytest.raises(InputError, match=r"holds a PointPillars, .*pointpillars_detector"):
         load_pointnet(other)
     unknown = with_header(path, tmp_path / "u.safetensors", network="transformer")
-    for read in read_header, network_of, load_network:
+    for read in read_header, read_network_name, load_network:
         with pytest.raises(InputError, match="'transformer', this version knows"):
             read(unknown)
     two = small(classes=("Car", "Pedestrian"), sizes=header.config.sizes[:2])
-    with pytest.raises(InputError, match=r"classes is .*Cyclist.*asked for was"):
+    with pytest.raises(InputError, match=r"classes is .*Cyclist.*expected was"):
         load_pointnet(path, two)
-    config = json.loads(header.text())["config"]
+    config = json.loads(header.to_json())["config"]
     for change, words in ((dict(classes=two.classes, sizes=two.sizes), "do not fit its header"),
                           (dict(classes=("Car", "Dog", "Cyclist")), "no class 'Dog'"),
                           (dict(colour=1), "'colour'")):
@@ -353,7 +358,7 @@ def test_one_function_opens_both(saved, tmp_path):
         with pytest.raises(InputError, match=words):
             open_detector(tmp_path / name)
     (tmp_path / "text").write_text("hello")
-    with pytest.raises(InputError, match="no checkpoint, or was cut"):
+    with pytest.raises(InputError, match="not a checkpoint, or is truncated"):
         open_detector(tmp_path / "text")
 
 

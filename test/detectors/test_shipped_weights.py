@@ -7,11 +7,11 @@ import pytest
 
 from lidar_perception.classes import CAR
 from lidar_perception.data.open import open_recording
-from lidar_perception.detectors.boxes import MARGIN
-from lidar_perception.detectors.checkpoint import network_of, read_header
+from lidar_perception.detectors.boxes import MARGIN_M
+from lidar_perception.detectors.checkpoint import read_header, read_network_name
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet.weights_file import WEIGHTS as POINTNET
-from lidar_perception.detectors.pointnet.weights_file import judge_file
+from lidar_perception.detectors.pointnet.weights_file import find_judge_weights
 from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.matching import match_centres
@@ -22,14 +22,14 @@ from lidar_perception.types import CLASSES
 # Others run these lines.
 pytestmark = [pytest.mark.no_cover,
               pytest.mark.usefixtures("one_thread", "streets")]
-FILES = [*sorted(WEIGHTS.glob("*.safetensors")), POINTNET, judge_file()]
+FILES = [*sorted(WEIGHTS.glob("*.safetensors")), POINTNET, find_judge_weights()]
 MOST = {"pointpillars": 30e6, "pointnet": 6e6}  # bytes of all files
 
 
 def test_they_are_small_enough_and_there():
     assert (WEIGHTS / "pointpillars_v4_compact.safetensors") in FILES  # the default
     for network, most in MOST.items():
-        assert 0 < sum(f.stat().st_size for f in FILES if network_of(f) == network) < most
+        assert 0 < sum(f.stat().st_size for f in FILES if read_network_name(f) == network) < most
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
@@ -73,7 +73,7 @@ def test_cars_alone_are_moved_to_where_their_points_begin(name, scans):
     before, after = found
     cars = before.class_ids == CAR
     ways = np.hypot(*(after.boxes - before.boxes)[:, :2].T)
-    assert 0.02 < ways[cars].max() <= MARGIN * 2**0.5 + 1e-5 and not ways[~cars].any()
+    assert 0.02 < ways[cars].max() <= MARGIN_M * 2**0.5 + 1e-5 and not ways[~cars].any()
     np.testing.assert_array_equal(after.boxes[:, 3:], before.boxes[:, 3:])
     np.testing.assert_array_equal(after.scores, before.scores)
 

@@ -15,7 +15,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.detectors.parallel import in_parts
+from lidar_perception.detectors.parallel import run_in_parts
 from lidar_perception.detectors.params import NmsParams
 from lidar_perception.detectors.pointpillars import sparse
 from lidar_perception.detectors.pointpillars.config import network_config
@@ -159,7 +159,7 @@ def test_an_error_in_one_part_is_raised(monkeypatch):
 
     torch.set_num_threads(2)
     with pytest.raises(ZeroDivisionError):
-        in_parts(fail, 100, 4)
+        run_in_parts(fail, 100, 4)
 
 
 @pytest.mark.parametrize("layer", ["pillar_net.linear.weight", "blocks.1.0.0.weight",

@@ -14,7 +14,12 @@ from click.testing import CliRunner
 from detection_samples import eager, frame, lively, make_detector, random_detector, same, tiny
 
 from lidar_perception.cli.main import cli
-from lidar_perception.detectors.checkpoint import Header, adopt, read_header, save_checkpoint
+from lidar_perception.detectors.checkpoint import (
+    Header,
+    copy_matching_weights,
+    read_header,
+    save_checkpoint,
+)
 from lidar_perception.detectors.pointpillars import weights_file as weights_module
 from lidar_perception.detectors.pointpillars.config import NetworkConfig, network_config
 from lidar_perception.detectors.pointpillars.detector import load_detector
@@ -62,7 +67,7 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
 
 def test_a_checkpoint_of_another_network_is_refused_with_both_values(saved):
     path, _, _ = saved
-    with pytest.raises(InputError, match=r"version is v4, asked for was v2"):
+    with pytest.raises(InputError, match=r"version is v4, expected was v2"):
         load_network(path, tiny("v2"))
     wanted = with_values(DetectorParams(), {"pointpillars.version": "v1"})
     with pytest.raises(InputError, match=r"has the version v4, not v1"):
@@ -75,29 +80,29 @@ def test_a_network_begins_with_what_fits_of_another(saved):
     path, header, network = saved
     state = network.state_dict()
     same = make_network(header.config)
-    taken, count = adopt(same, path, NetworkConfig)
+    taken, count = copy_matching_weights(same, path, NetworkConfig)
     assert taken == count == len(state)
     assert all(torch.equal(value, state[name]) for name, value in same.state_dict().items())
     # without the branch of the map the first block has fewer inputs, of which it takes its own
     other = make_network(tiny("v1"))
-    taken, count = adopt(other, path, NetworkConfig)
+    taken, count = copy_matching_weights(other, path, NetworkConfig)
     assert taken == count
     first, old = (s["blocks.0.0.0.weight"] for s in (other.state_dict(), state))
     assert first.shape[1] < old.shape[1] and torch.equal(first, old[:, :first.shape[1]])
     # a new input, such as the number of the cluster, comes last and begins at 0
     numbered = make_network(tiny("v2"))
-    assert len(set(adopt(numbered, path, NetworkConfig))) == 1
+    assert len(set(copy_matching_weights(numbered, path, NetworkConfig))) == 1
     first, old = (s["pillar_net.linear.weight"] for s in (numbered.state_dict(), state))
     assert torch.equal(first[:, :-1], old) and not first[:, -1].any()
     # and another neck begins at random
     third = make_network(tiny("v0"))
     before = {name: value.clone() for name, value in third.state_dict().items()}
-    taken, count = adopt(third, path, NetworkConfig)
+    taken, count = copy_matching_weights(third, path, NetworkConfig)
     assert 0 < taken < count
     assert all(torch.equal(value, before[name]) for name, value in third.state_dict().items()
                if name.startswith("neck"))
     with pytest.raises(InputError, match="no layer"):
-        adopt(torch.nn.Linear(2, 3), path, NetworkConfig)
+        copy_matching_weights(torch.nn.Linear(2, 3), path, NetworkConfig)
 
 
 def test_files_that_are_no_checkpoints_are_refused(saved, tmp_path):
@@ -106,8 +111,8 @@ def test_files_that_are_no_checkpoints_are_refused(saved, tmp_path):
     length = struct.unpack("<Q", content[:8])[0]
     names = json.loads(content[8:8 + length])
     other = json.loads(names["__metadata__"]["lidar_perception"])
-    cases = {"missing": (None, "no checkpoint"), "cut": (content[:-9], "cut short"),
-             "text": (b"hello", "cut short"), "empty": (b"", "cut short")}
+    cases = {"missing": (None, "no checkpoint"), "cut": (content[:-9], "is truncated"),
+             "text": (b"hello", "is truncated"), "empty": (b"", "is truncated")}
     for name, change, words in (
             ("foreign", None, "import-weights"), ("later", dict(format=9), "format 9"),
             ("unknown", dict(config={**other["config"], "colour": 1}), "'colour'"),

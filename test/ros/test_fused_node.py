@@ -14,7 +14,7 @@ from detector_node import DetectorUnderTest, assert_equal, message, received, sm
 from test_bad_input import BAD, cloud
 
 from lidar_perception.detectors.fused.detector import load_fused_detector
-from lidar_perception.detectors.fused.fusion import package_models, write_fusion
+from lidar_perception.detectors.fused.fusion import load_shipped_models, write_fusion
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams
 from lidar_perception.nodes.fused_detector import FusedNode
 from lidar_perception.nodes.graph import build_graph
@@ -36,7 +36,7 @@ def weights(tmp_path_factory) -> Path:
     """A file of `train fused` of small weights, with curves of its own."""
     folder = tmp_path_factory.mktemp("weights")
     models = {name: {**model, "bias": model["bias"] + 1}
-              for name, model in package_models().items()}
+              for name, model in load_shipped_models().items()}
     write_fusion(folder / "fused.json", (small_v4(folder), None), models, {})
     return folder / "fused.json"
 

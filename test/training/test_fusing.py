@@ -22,15 +22,15 @@ from lidar_perception.detectors.fused.detector import FusedDetector, Proposals, 
 from lidar_perception.detectors.fused.fusion import (
     KNOTS,
     PACKAGE,
-    fusion_of,
-    package_models,
+    find_fusion,
+    load_shipped_models,
     read_fusion,
     weights_file,
     write_fusion,
 )
-from lidar_perception.detectors.fused.model import probabilities
+from lidar_perception.detectors.fused.model import compute_probabilities
 from lidar_perception.detectors.fused.params import FusedParams
-from lidar_perception.detectors.open import doubts, open_detector
+from lidar_perception.detectors.open import check_weights, open_detector
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file as classifier_file
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
@@ -64,21 +64,21 @@ def draw_samples(rng, count: int, class_id: int, odds: float = -1.5) -> Samples:
 def test_fitted_scores_are_probabilities_in_any_order_of_scans(seed):
     rng = np.random.default_rng(seed)
     own = draw_samples(rng, 4000, PEDESTRIAN)
-    models, fits = fit_classes(own, package_models())
+    models, fits = fit_classes(own, load_shipped_models())
     other = draw_samples(rng, 20_000, PEDESTRIAN)
-    scores = probabilities(models, other.class_ids, other.evidence)
+    scores = compute_probabilities(models, other.class_ids, other.evidence)
     for low in np.arange(0.1, 0.9, 0.2):
         chosen = (scores >= low) & (scores < low + 0.2)
         assert abs(other.right[chosen].mean() - scores[chosen].mean()) < 0.08
     assert fits["Pedestrian"].after.loss < fits["Pedestrian"].before.loss
     assert fits["Pedestrian"].proposals == 4000
     assert fits["Pedestrian"].right == own.right.sum()
-    again, _ = fit_classes(own.take(rng.permutation(4000)), package_models())
+    again, _ = fit_classes(own.take(rng.permutation(4000)), load_shipped_models())
     for curve, before in zip(again["Pedestrian"]["curves"].values(),
                              models["Pedestrian"]["curves"].values()):
         np.testing.assert_allclose(curve["values"], before["values"], atol=0.02)
     # A class with too few samples keeps its curves.
-    assert models["Car"] == package_models()["Car"] and fits["Car"].after is None
+    assert models["Car"] == load_shipped_models()["Car"] and fits["Car"].after is None
 
 
 def test_curves_are_not_fitted_to_too_few_samples():
@@ -87,8 +87,8 @@ def test_curves_are_not_fitted_to_too_few_samples():
         own = draw_samples(rng, 500, CAR)
         own.right[:] = np.arange(500) < right
         own.scans[:] = np.arange(500) % 2
-        models, fits = fit_classes(own, package_models())
-        assert (models["Car"] == package_models()["Car"]) == (right < MIN_SAMPLES)
+        models, fits = fit_classes(own, load_shipped_models())
+        assert (models["Car"] == load_shipped_models()["Car"]) == (right < MIN_SAMPLES)
         assert (fits["Car"].after is None) == (right < MIN_SAMPLES)
         models, _ = fit_classes(own, {"Cyclist": models["Cyclist"]})  # a new class
         assert ("Car" in models) == (right >= MIN_SAMPLES)
@@ -120,7 +120,7 @@ def others(tmp_path):
     classifier = tmp_path / "own/pointnet.safetensors"
     classifier.parent.mkdir()
     classifier.write_bytes(classifier_file(PointNetParams()).read_bytes())
-    models = json.loads(json.dumps(package_models()))
+    models = json.loads(json.dumps(load_shipped_models()))
     for model in models.values():
         model["bias"] += 1.0
     write_fusion(tmp_path / "fused.json", (None, classifier), models, {"scans": 3})
@@ -130,36 +130,37 @@ def others(tmp_path):
 def test_fusion_file_round_trip_in_moved_folder(others, tmp_path, monkeypatch):
     path, models = others
     fusion = read_fusion(path)
-    assert fusion.models == models and fusion.fitted_to == {"scans": 3} and fusion.doubt is None
+    assert fusion.models == models and fusion.fitted_to == {"scans": 3}
+    assert fusion.curve_warning is None
     assert fusion.proposer == proposer_file(PointPillarsParams())
     moved = tmp_path.parent / f"{tmp_path.name}-moved"
     tmp_path.rename(moved)
     again = read_fusion(moved / "fused.json")
-    assert again.classifier == moved / "own/pointnet.safetensors" and again.doubt is None
+    assert again.classifier == moved / "own/pointnet.safetensors" and again.curve_warning is None
     monkeypatch.chdir(moved)
     assert open_detector("fused.json", "cpu").models == models
     assert weights_file(FusedParams(weights="fused.json")).name == "fused.json"
     # Weights that changed or are lost.
     again.classifier.write_bytes(again.classifier.read_bytes() + b"\0")
-    assert "pointnet.safetensors, so that its scores" in read_fusion(moved / "fused.json").doubt
+    assert "pointnet.safetensors, so its scores" in read_fusion(moved / "fused.json").curve_warning
     again.classifier.unlink()
-    with pytest.raises(InputError, match=r"is made of .*pointnet.safetensors, which is not there"):
+    with pytest.raises(InputError, match=r"needs .*pointnet.safetensors, which does not exist"):
         read_fusion(moved / "fused.json")
 
 
 def test_package_curves_warn_about_other_weights(others):
     path, _ = others
-    assert fusion_of().doubt is None and doubts(PACKAGE, 1.73) == []
+    assert find_fusion().curve_warning is None and check_weights(PACKAGE, 1.73) == []
     assert open_detector("fused", "cpu").warning is None
     other = str(proposer_file(PointPillarsParams(version="v1")))
     for params in FusedParams(weights=other), FusedParams(classifier=other):
-        assert f"other weights than {other}" in fusion_of("", params).doubt
-        assert fusion_of("", params).models == package_models()
-    with pytest.raises(InputError, match=r"names its own cluster network; leave fused.classifier"):
-        fusion_of(path, FusedParams(classifier=other))
+        assert f"other weights than {other}" in find_fusion("", params).curve_warning
+        assert find_fusion("", params).models == load_shipped_models()
+    with pytest.raises(InputError, match=r"has its own PointNet weights; leave fused.classifier"):
+        find_fusion(path, FusedParams(classifier=other))
     for group in "weights", "classifier":
         with pytest.raises(InputError, match=rf"no checkpoint nowhere; .* fused.{group}"):
-            fusion_of("", FusedParams(**{group: "nowhere"}))
+            find_fusion("", FusedParams(**{group: "nowhere"}))
 
 
 def test_missing_class_and_foreign_sensor_are_reported(others):
@@ -169,8 +170,8 @@ def test_missing_class_and_foreign_sensor_are_reported(others):
         "sensor": {"name": "vlp-16", "height": 0.6}}))
     del models["Cyclist"]
     write_fusion(path, (None, classifier), models, {})
-    never, other = doubts(path, 1.73)
-    assert never.startswith("fused detects no Cyclist, as there are")
+    never, other = check_weights(path, 1.73)
+    assert never.startswith("fused detects no Cyclist, because it has curves only for")
     assert str(classifier) in other and "the sensor vlp-16 at 0.6 m" in other
     assert open_detector(path, "cpu").warning == never
 
@@ -201,7 +202,7 @@ def test_damaged_file_is_used_or_refused_in_one_line(tmp_path):
             refused += 1
             continue
         for name in DETECTED:
-            scores = probabilities(models, np.full(4, CLASSES.index(name)), evidence)
+            scores = compute_probabilities(models, np.full(4, CLASSES.index(name)), evidence)
             assert ((scores >= 0) & (scores <= 1)).all()
     assert 15 < refused < 100
 
@@ -220,7 +221,7 @@ def test_train_fused_writes_usable_file(tmp_path, monkeypatch, capsys):
     assert "2 street scans of vlp-16 at 1 m, all around" in said.err
     assert "too few to fit curves to" in " ".join(said.out.split())
     fusion = read_fusion(out)
-    assert fusion.models == package_models() and fusion.doubt is None
+    assert fusion.models == load_shipped_models() and fusion.curve_warning is None
     assert fusion.fitted_to["sensor"] == "vlp-16" and fusion.fitted_to["range"] == "around"
     before = out.read_bytes()
     assert exit_of(monkeypatch, *command) == 2 and "exists already" in error_line(capsys)

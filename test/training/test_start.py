@@ -149,8 +149,8 @@ def test_resumed_run_keeps_plan_and_refuses_other_settings(tmp_path, one_thread)
     record = read_header(out / "last.safetensors").training
     assert record["sensor"] == {"name": str(sensor), "height": 0.6, "beams": 5}
     header = read_header(out / "last.safetensors")
-    assert header.unlike(0.7) is None and "at 0.6 m, and used with one at 1.73 m" in header.unlike(
-        1.73)
+    assert header.find_height_mismatch(0.7) is None
+    assert "at 0.6 m, and used with one at 1.73 m" in header.find_height_mismatch(1.73)
     plan = json.loads((out / RUN).read_text())["plan"]
     assert (plan["scans"], plan["steps"]) == (2, 2)
     other = CliRunner().invoke(cli, [*arguments, "--resume"])
@@ -183,7 +183,8 @@ def test_unusable_first_scenes_are_skipped(kind, tmp_path, one_thread):
     assert done.stderr.count("validation: ") == 2
     header = read_header(tmp_path / "run/last.safetensors")
     assert header.training["sensor"] == {"height": SENSOR_HEIGHT}  # no sensor was simulated
-    assert header.unlike(SENSOR_HEIGHT) is None and "for a sensor at 1.73" in header.unlike(0.6)
+    assert header.find_height_mismatch(SENSOR_HEIGHT) is None
+    assert "for a sensor at 1.73" in header.find_height_mismatch(0.6)
     write(held, "000002\n000003\n")
     refused = small_run(kind, tmp_path / "other", root, "--val-split", str(held)).exception
     assert isinstance(refused, InputError) and "\n" not in str(refused)

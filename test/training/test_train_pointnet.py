@@ -12,7 +12,7 @@ from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet.config import NETWORKS
 from lidar_perception.detectors.pointnet.network import load_pointnet
-from lidar_perception.detectors.pointnet.weights_file import judge_file
+from lidar_perception.detectors.pointnet.weights_file import find_judge_weights
 from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.training.params import PointNetTraining
@@ -47,7 +47,7 @@ def test_trained_network_opens_as_detector(cache, tmp_path):
     header, network = load_pointnet(out / "last.safetensors")
     assert header.config.name == "improved" and header.training["steps"] == 3
     assert {"score", "accuracy", "calibration_error"} <= set(header.metrics)
-    json.loads(header.text())
+    json.loads(header.to_json())
     assert network.offsets.abs().sum() > 0  # calibrated
     open_detector(out / "last.safetensors", "cpu")(simulate_scan(3, 0, find_sensor(SENSOR)).frame)
     # the same seed gives the same weights, also from the cache
@@ -69,7 +69,8 @@ def test_proposer_is_recorded_and_must_be_pointpillars(cache, tmp_path):
     assert result.exit_code == 0, result.output
     training = read_header(tmp_path / "run/last.safetensors").training
     assert training["params"]["proposer"] == "package"
-    for file, words in (tmp_path / "none", "no checkpoint"), (judge_file(), "no PointPillars"):
+    for file, words in ((tmp_path / "none", "no checkpoint"),
+                        (find_judge_weights(), "no PointPillars")):
         result = train(cache, tmp_path / "bad", **{"--proposer": file})
         assert isinstance(result.exception, InputError) and words in str(result.exception)
         assert not (tmp_path / "bad").exists()

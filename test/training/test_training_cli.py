@@ -66,7 +66,7 @@ def test_trained_network_opens_as_detector(
     assert (record["steps"], record["seed"], record["batch"], record["scenes"]) == (4, 5, 2, 1)
     assert record["data"] == ["sim"] and record["params"]["sensor"] == SENSOR
     assert "score" in header.metrics and header.commit
-    json.loads(header.text())
+    json.loads(header.to_json())
     detector = load_detector(out / "best.safetensors", "cpu")
     detector(simulate_scan(3, 0, find_sensor(SENSOR)).frame)
     # a finished run does not change

@@ -10,7 +10,7 @@ import click
 from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import Walk, a_path, no_labels, walk_options
 from lidar_perception.cli.options import Runs, Settings, checked, settings_options
-from lidar_perception.detectors.open import POINTNET, default_params, kind_and_file
+from lidar_perception.detectors.open import POINTNET, default_params, resolve_weights
 from lidar_perception.detectors.pointnet.weights_file import WEIGHTS
 from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.terminal import console
@@ -19,7 +19,7 @@ from lidar_perception.types import InputError
 
 def _file(weights: Path | None) -> Path:
     """Return the checkpoint of --weights; InputError if it is not one of PointNet."""
-    kind, path = (POINTNET, None) if weights is None else kind_and_file(weights)
+    kind, path = (POINTNET, None) if weights is None else resolve_weights(weights)
     if kind != POINTNET:
         raise InputError(f"{weights} is a detector {kind}; give a checkpoint of {POINTNET}")
     return path or WEIGHTS

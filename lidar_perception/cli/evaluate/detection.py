@@ -64,7 +64,7 @@ def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None,
       lidar-perception evaluate detection drive --weights v4.safetensors --keep 0.1
     """
     from lidar_perception.data.frame import BOXES, CAMERA
-    from lidar_perception.detectors.open import doubts
+    from lidar_perception.detectors.open import check_weights
     from lidar_perception.scoring.detections import by_detector, by_files
     from lidar_perception.scoring.kitti.box_errors import box_errors, print_box_errors
     from lidar_perception.scoring.kitti.protocol import SCORED, Comparison
@@ -96,7 +96,7 @@ def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None,
     else:
         assert detector is not None  # as there are no --results
         height = recording.frames[0].sensor_height
-        for doubt in doubts(Path(detector.weights), height):
+        for doubt in check_weights(Path(detector.weights), height):
             terminal_errors.print(doubt)
         start = by_detector(partial(detector.open, min_score=min_score, sensor_height=height), keep,
                             write_results)

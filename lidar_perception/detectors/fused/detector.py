@@ -14,11 +14,19 @@ import numpy as np
 from lidar_perception.classes import CAR
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.base import NetworkDetector, make_synthetic_frame
-from lidar_perception.detectors.boxes import cars_on_points, moved_towards, on_ground
+from lidar_perception.detectors.boxes import move_cars_to_points, move_to_ground, move_towards
 from lidar_perception.detectors.contract import DetectionResult
-from lidar_perception.detectors.fused.evidence import Evidence, clipped_logit, silhouette_at
-from lidar_perception.detectors.fused.fusion import Models, fusion_of, package_models
-from lidar_perception.detectors.fused.model import at_most, probabilities, sources
+from lidar_perception.detectors.fused.evidence import (
+    Evidence,
+    find_silhouette_confidence,
+    to_log_odds,
+)
+from lidar_perception.detectors.fused.fusion import Models, find_fusion, load_shipped_models
+from lidar_perception.detectors.fused.model import (
+    compute_max_probabilities,
+    compute_probabilities,
+    compute_source_probabilities,
+)
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.nms import keep_first, rotated_nms
 from lidar_perception.detectors.normalized_view import (
@@ -49,7 +57,7 @@ class Proposals(NamedTuple):
         evidence: log-odds (K,) of each source.
         obstacles: (N, 3) xyz of the points of the view that are not ground.
         ground: (G, 3) xyz of the ground points of the view.
-        problem: why nothing, or little, can be detected, or None.
+        problem: why nothing or little can be detected, or None.
         timings: milliseconds of each step.
     """
 
@@ -68,7 +76,7 @@ class FusedDetector(NetworkDetector):
     Args:
         proposer, classifier: the networks. The curves of `models` were fitted to the proposer's
             raw scores.
-        models: curves that turn evidence into probabilities; None: those of the package.
+        models: curves that turn evidence into probabilities; None: the shipped ones.
     """
 
     group = "fused"
@@ -79,7 +87,7 @@ class FusedDetector(NetworkDetector):
                  models: Models | None = None, warning: str | None = None):
         super().__init__(params, warning)
         self.proposer, self.classifier = proposer.with_raw_scores(), classifier
-        self.models = package_models() if models is None else models
+        self.models = load_shipped_models() if models is None else models
 
     @property
     def networks(self) -> tuple[TrainedNetwork, ...]:
@@ -109,7 +117,7 @@ class FusedDetector(NetworkDetector):
 
     def propose(self, frame: PointCloud, ground: np.ndarray | None = None,
                 cluster_ids: np.ndarray | None = None,
-                min_scores: ScoreParams = ScoreParams.all_alike(0.0)) -> Proposals:
+                min_scores: ScoreParams = ScoreParams.for_all_classes(0.0)) -> Proposals:
         """Return the proposals for a cropped frame with the evidence of all sources.
 
         Args:
@@ -133,19 +141,19 @@ class FusedDetector(NetworkDetector):
             columns = experts(view.frame, config, is_ground, view.take(cluster_ids),
                               params.ground, params.clustering)
             found = self.proposer.propose(
-                view, *columns, ScoreParams.all_alike(settings.proposals),
+                view, *columns, ScoreParams.for_all_classes(settings.proposals),
                 replace(settings.nms, max_boxes=settings.max_proposals), settings.cpu_fallback)
             people = clusters.result()[~is_ground]
         times.append(perf_counter())
         proposed = drop_ego_vehicle(found.detections, view.pose.height)
-        evidence = {"network": clipped_logit(proposed.scores), "silhouette": clipped_logit(
-            silhouette_at(proposed.boxes, obstacles.xyz, floor, people))}
-        limits = at_most(self.models, proposed.class_ids, evidence, "classifier")
+        evidence = {"network": to_log_odds(proposed.scores), "silhouette": to_log_odds(
+            find_silhouette_confidence(proposed.boxes, obstacles.xyz, floor, people))}
+        limits = compute_max_probabilities(self.models, proposed.class_ids, evidence, "classifier")
         probability, boxes = self.classifier.classify(
-            proposed, obstacles, floor, min_scores.passed(replace(proposed, scores=limits)),
+            proposed, obstacles, floor, min_scores.passes(replace(proposed, scores=limits)),
             settings.cpu_fallback)
-        evidence["classifier"] = clipped_logit(probability)
-        boxes = moved_towards(proposed.boxes, boxes, settings.classifier_box).astype(np.float32)
+        evidence["classifier"] = to_log_odds(probability)
+        boxes = move_towards(proposed.boxes, boxes, settings.classifier_box).astype(np.float32)
         times.append(perf_counter())
         return Proposals(replace(proposed, boxes=boxes), evidence, obstacles.xyz, floor,
                          found.problem, dict(zip(STEPS, (np.diff(times) * 1e3).tolist())))
@@ -155,17 +163,18 @@ class FusedDetector(NetworkDetector):
         without any, also the highest score of each class."""
         settings, class_ids = self.settings, proposals.detections.class_ids
         scored = replace(proposals.detections,
-                         scores=probabilities(self.models, class_ids, proposals.evidence),
-                         sources=sources(self.models, class_ids, proposals.evidence))
-        found = scored[settings.scores.passed(scored)]
+                         scores=compute_probabilities(self.models, class_ids, proposals.evidence),
+                         sources=compute_source_probabilities(self.models, class_ids,
+                                                              proposals.evidence))
+        found = scored[settings.scores.passes(scored)]
         if len(found) == 0:
             return found, {
                 name: float(scored.scores[class_ids == CLASSES.index(name)].max(initial=0.0))
                 for name in self.classes}
-        boxes = cars_on_points(found.boxes, found.class_ids, proposals.obstacles,
+        boxes = move_cars_to_points(found.boxes, found.class_ids, proposals.obstacles,
                                settings.on_points)
         heights = fit_ground_heights(proposals.ground, boxes[:, :2])
-        moved = replace(found, boxes=on_ground(boxes, heights, settings.on_ground).astype(
+        moved = replace(found, boxes=move_to_ground(boxes, heights, settings.on_ground).astype(
             np.float32))
         return moved[remove_duplicates(moved, settings)], {}
 
@@ -197,14 +206,14 @@ def load_fused_detector(path: str | Path = "", device: str = "auto",
     """Load the fused detector.
 
     Args:
-        path: file of `train fused`, or weights of PointPillars; empty: what `params` name, or else
-            what comes with the package.
+        path: output of `train fused`, or weights of PointPillars; empty: the files in `params`, by
+            default the shipped ones.
 
     Raises:
-        InputError: see fusion_of, load_detector and load_pointnet_detector.
+        InputError: see find_fusion, load_detector and load_pointnet_detector.
     """
     settings = params.fused
-    fusion = fusion_of(path, settings)
+    fusion = find_fusion(path, settings)
     proposer = load_detector(fusion.proposer, device, DetectorParams(
         pointpillars=PointPillarsParams(range=settings.range, amp=settings.amp, warm_up=False,
                                         threads=settings.threads, engine=settings.engine,
@@ -214,7 +223,7 @@ def load_fused_detector(path: str | Path = "", device: str = "auto",
                                 engine="torch" if settings.engine == "torch" else "auto"))
     ).classifier
     detector = FusedDetector(proposer, classifier, params, fusion.models,
-                             "; ".join(fusion.doubts(proposer.classes)) or None)
+                             "; ".join(fusion.find_warnings(proposer.classes)) or None)
     if settings.warm_up:
         detector.warm_up()
     return detector

@@ -1,8 +1,8 @@
-"""How much each source counts: by class, the log-odds of the sources summed along fitted curves.
+"""Combination of the evidence: per class, a sum of fitted curves of the sources' log-odds.
 
-Two sources that see the same thing are not independent, so a plain sum would be too sure. The
-curves were fitted together, to simulated scans that no source was trained on, so that the sum is
-the probability there; fusion.py reads them.
+Sources that see the same object are not independent, so a plain sum would be overconfident. The
+curves are fitted jointly, on simulated scans that no source was trained on, so that the sum is a
+calibrated probability. fusion.py reads them.
 """
 
 from __future__ import annotations
@@ -16,9 +16,12 @@ from lidar_perception.detectors.fused.fusion import Models
 from lidar_perception.types import CLASSES
 
 
-def probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence) -> np.ndarray:
-    """(K,) float32, 0..1, that each of K proposals is of its class, class_ids (K,) into CLASSES; 0
-    for a class that nothing was fitted for."""
+def compute_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence) -> np.ndarray:
+    """Return the probability (K,) float32 that each proposal is an object of its class.
+
+    Args:
+        class_ids: (K,) indices into CLASSES; a class without a model gets 0.
+    """
     result = np.zeros(len(class_ids), np.float32)
     for class_id in np.unique(class_ids):
         own = class_ids == class_id
@@ -29,22 +32,25 @@ def probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence) -> 
     return result
 
 
-def at_most(models: Models, class_ids: np.ndarray, evidence: Evidence,
+def compute_max_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence,
             source: str) -> np.ndarray:
-    """(K,) float32: the greatest probability that each of K proposals can have, whatever one more
-    source will say."""
+    """Return the highest probability (K,) float32 that each proposal can reach once the evidence of
+    `source` is added."""
     count = len(class_ids)
-    return np.maximum(*(probabilities(models, class_ids, {**evidence, source: np.full(count, said)})
-                        for said in (np.inf, np.nan)))
+    return np.maximum(*(compute_probabilities(models, class_ids,
+                                              {**evidence, source: np.full(count, log_odds)})
+                        for log_odds in (np.inf, np.nan)))
 
 
-def sources(models: Models, class_ids: np.ndarray,
-            evidence: Evidence) -> dict[str, np.ndarray]:
-    """By source, the probability (K,) float32 that it alone gives each of K proposals; NaN where it
-    says nothing, or does not count for the class."""
-    counts = {source: [i for i, name in enumerate(CLASSES)
-                       if source in models.get(name, {"curves": {}})["curves"]]
-              for source in evidence}
-    return {source: np.where(np.isin(class_ids, counts[source]), expit(odds), np.nan).astype(
+def compute_source_probabilities(models: Models, class_ids: np.ndarray,
+                                 evidence: Evidence) -> dict[str, np.ndarray]:
+    """Return, by source, the probability (K,) float32 from this source alone.
+
+    It is NaN where the source gives no evidence, or is not part of the model of the class.
+    """
+    used_for = {source: [i for i, name in enumerate(CLASSES)
+                         if source in models.get(name, {"curves": {}})["curves"]]
+                for source in evidence}
+    return {source: np.where(np.isin(class_ids, used_for[source]), expit(odds), np.nan).astype(
         np.float32) for source, odds in evidence.items()}
 

@@ -22,7 +22,7 @@ from lidar_perception.detectors.matrix_kernel import (
     padded,
     padded_bias,
 )
-from lidar_perception.detectors.parallel import in_parts
+from lidar_perception.detectors.parallel import run_in_parts
 from lidar_perception.detectors.pointnet import kernels
 from lidar_perception.detectors.pointnet.clusters import ClusterInput
 from lidar_perception.detectors.pointnet.network import (
@@ -82,7 +82,7 @@ class CompiledPointNet:
                 values[rows] = self._values(inputs.points[rows], inputs.valid[rows],
                                             inputs.context[rows])
 
-        in_parts(compute, len(values), -(-len(values) // CHUNK))
+        run_in_parts(compute, len(values), -(-len(values) // CHUNK))
         return Outputs(*torch.from_numpy(values).split([classes, 3, 3, bins, bins], dim=1))
 
     def _values(self, points: np.ndarray, valid: np.ndarray, context: np.ndarray) -> np.ndarray:

@@ -12,10 +12,10 @@ import torch
 
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.base import NetworkDetector, make_synthetic_frame
-from lidar_perception.detectors.boxes import cars_on_points
-from lidar_perception.detectors.calibration import calibrated
+from lidar_perception.detectors.boxes import move_cars_to_points
+from lidar_perception.detectors.calibration import calibrate_scores
 from lidar_perception.detectors.contract import DetectionResult
-from lidar_perception.detectors.devices import chosen_device
+from lidar_perception.detectors.devices import find_device
 from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.detectors.normalized_view import (
     NormalizedView,
@@ -78,7 +78,7 @@ class PointNetDetector(NetworkDetector):
         predictions = self.classifier.predict(clusters, cpu_fallback=settings.cpu_fallback)
         t5 = self.classifier.now()
         detections, best, broken = self._detections(predictions)
-        boxes = cars_on_points(detections.boxes, detections.class_ids,
+        boxes = move_cars_to_points(detections.boxes, detections.class_ids,
                                view.frame.xyz.compress(~ground, axis=0), settings.on_points)
         detections = restore_detections(replace(detections, boxes=boxes.astype(np.float32)),
                                         view.pose)
@@ -98,7 +98,7 @@ class PointNetDetector(NetworkDetector):
                       f"{len(sound) - sound.sum()} of {len(sound)} clusters; the weights or the "
                       "intensity are broken")
         predicted = predicted.take(np.flatnonzero(sound))
-        detections = calibrated(
+        detections = calibrate_scores(
             found(predicted, self.classifier.config,
                   self.classifier.raw_scores(self.min_scores), self.settings.nms),
             self.classifier.header.calibration)
@@ -147,7 +147,7 @@ def load_pointnet_detector(path: str | Path = "", device: str = "auto",
     path = Path(path) if str(path) not in ("", ".") else weights_file(settings)
     if settings.threads:
         torch.set_num_threads(settings.threads)
-    target = chosen_device(device)
+    target = find_device(device)
     header, network = load_pointnet(path)
     if params is None:
         params = PointNetDetectorParams(ground=header.config.ground,

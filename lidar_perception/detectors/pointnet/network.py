@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
-from lidar_perception.detectors.checkpoint import Header, load
+from lidar_perception.detectors.checkpoint import Header, load_checkpoint
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 
 POINT, CONTEXT = 5, 6   # numbers that describe a point, and a whole cluster; see clusters.py
@@ -220,4 +220,4 @@ def load_pointnet(path: str | Path,
                   expected: PointNetConfig | None = None) -> tuple[Header, PointNet]:
     """Header and network of a checkpoint, in float32 on the CPU, in training mode. InputError if
     the file cannot be used, or holds another network than expected."""
-    return load(path, PointNetConfig, make_pointnet, expected)
+    return load_checkpoint(path, PointNetConfig, make_pointnet, expected)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lidar_perception.clustering.params import ClusteringParams
-from lidar_perception.detectors.params import NetworkParams, share_on_points
+from lidar_perception.detectors.params import NetworkParams, make_on_points_param
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import param
@@ -23,7 +23,7 @@ class PointNetParams(NetworkParams):
     max_clusters: int = param(4000, "Clusters that are looked at, the nearest first; a scan has "
                               "some hundred. The diagnostics say how many are left out.", low=1,
                               high=1_000_000)
-    on_points: float = share_on_points()
+    on_points: float = make_on_points_param()
     engine: str = param("auto", "What runs the network on the CPU. torch: torch. auto: compiled "
                         "kernels on x86-64 with AVX2, otherwise torch. Detections are the same.",
                         choices=("auto", "torch"), fixed=True)

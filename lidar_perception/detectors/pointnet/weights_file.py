@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lidar_perception.detectors.pointnet.params import PointNetParams
-from lidar_perception.detectors.weights_file import existing
+from lidar_perception.detectors.weights_file import require_weights
 from lidar_perception.types import InputError
 
 WEIGHTS = Path(__file__).parent / "weights" / "pointnet.safetensors"
@@ -16,11 +16,11 @@ def weights_file(params: PointNetParams) -> Path:
     """The file that params name, or else the one that comes with the package. InputError if it is
     not there."""
     if params.weights:
-        return existing(params.weights, "pointnet.weights")
+        return require_weights(params.weights, "pointnet.weights")
     return _shipped(WEIGHTS)
 
 
-def judge_file() -> Path:
+def find_judge_weights() -> Path:
     """Those that were trained to judge the boxes of other detectors. InputError likewise."""
     return _shipped(WEIGHTS.with_name(JUDGE))
 

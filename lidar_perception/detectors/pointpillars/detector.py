@@ -12,7 +12,7 @@ import torch
 
 from lidar_perception.detectors.base import NetworkDetector, make_synthetic_frame
 from lidar_perception.detectors.contract import DetectionResult
-from lidar_perception.detectors.devices import CPU, chosen_device
+from lidar_perception.detectors.devices import CPU, find_device
 from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.detectors.normalized_view import NormalizedView, restore_detections
 from lidar_perception.detectors.pointpillars.expert import experts
@@ -117,7 +117,7 @@ def load_detector(path: str | Path = "", device: str = "auto",
             raise InputError(f"{path} runs in ONNX Runtime; set engine: auto, or use the "
                              "checkpoint it was exported from")
     else:
-        target = chosen_device(device)
+        target = find_device(device)
         header, loaded = load_network(path)
         if target != CPU and params.pointpillars.engine == "sparse":
             raise InputError(f"the sparse engine runs on the CPU, not on {target}; set device: "

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
-from lidar_perception.detectors.checkpoint import Header, Net, load
+from lidar_perception.detectors.checkpoint import Header, Net, load_checkpoint
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 
@@ -266,4 +266,4 @@ def load_network(path: str | Path,
                  expected: NetworkConfig | None = None) -> tuple[Header, PointPillars]:
     """Header and network of a checkpoint, in float32 on the CPU, in training mode. InputError if
     the file cannot be used, or holds another network than expected."""
-    return load(path, NetworkConfig, make_network, expected)
+    return load_checkpoint(path, NetworkConfig, make_network, expected)

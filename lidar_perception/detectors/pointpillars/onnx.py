@@ -82,7 +82,7 @@ def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None
             dynamic_shapes=free)
     assert program is not None  # as dynamo is True
     model = program.model_proto
-    onnx.helper.set_model_props(model, {KEY: header.text()})
+    onnx.helper.set_model_props(model, {KEY: header.to_json()})
     onnx.checker.check_model(model)
     write_bytes(path, model.SerializeToString())
 
@@ -115,7 +115,7 @@ class OnnxNetwork:
         except Exception as error:  # its errors have no common base
             reason = str(error).splitlines()[0]
             raise InputError(f"ONNX Runtime cannot read {path}: {reason}") from None
-        header = Header.of_text(text, str(path), NetworkConfig)
+        header = Header.from_json(text, str(path), NetworkConfig)
         wanted = {name: (f"tensor({kind})", len(shape)) for name, (kind, shape) in
                   _inputs(header.config).items()}
         found = {i.name: (i.type, len(i.shape)) for i in session.get_inputs()}

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams, DbscanParams
 from lidar_perception.detectors.params import (
     NetworkParams,
-    layers_format,
-    network_engine,
-    seen_range,
+    make_amp_param,
+    make_engine_param,
+    make_range_param,
 )
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import param
@@ -31,9 +31,9 @@ class PointPillarsParams(NetworkParams):
     size: str = param("auto", "full: the paper's network, for a GPU. compact: for two CPU cores. "
                       "auto: what the weights are; compact without weights.",
                       choices=("auto", "full", "compact"), fixed=True)
-    range: str = seen_range()
-    amp: str = layers_format()
-    engine: str = network_engine()
+    range: str = make_range_param()
+    amp: str = make_amp_param()
+    engine: str = make_engine_param()
 
 
 # The experts of paper B: Patchwork++ and DBSCAN, of which it gives no numbers. Ours, chosen on

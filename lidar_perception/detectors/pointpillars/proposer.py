@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from lidar_perception.detectors.calibration import calibrated
+from lidar_perception.detectors.calibration import calibrate_scores
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.devices import CPU
@@ -105,7 +105,7 @@ class PointPillarsProposer(TrainedNetwork):
 
         def work() -> tuple[list[float], DetectionResult]:
             times, predictions = self._predict(inputs)
-            found = self._decode(predictions, self.raw_scores(scores.of_classes(self.classes)),
+            found = self._decode(predictions, self.raw_scores(scores.get_all(self.classes)),
                                  nms)
             return [begin, *times, self.now()], found
 
@@ -152,9 +152,9 @@ class PointPillarsProposer(TrainedNetwork):
     def _decode(self, predictions: dict[bool, Prediction], min_scores: list[float],
                 nms: NmsParams) -> DetectionResult:
         """Return the detections of all passes together."""
-        passed = [self._select_boxes(half_turn, prediction, min_scores, nms.candidates)
+        passes = [self._select_boxes(half_turn, prediction, min_scores, nms.candidates)
                   for half_turn, prediction in predictions.items()]
-        boxes, best_logits, labels = map(np.concatenate, zip(*passed))
+        boxes, best_logits, labels = map(np.concatenate, zip(*passes))
         best: dict[str, float] = {}
         problem: str | None = None
         logits = [prediction.logits for prediction in predictions.values()
@@ -168,8 +168,8 @@ class PointPillarsProposer(TrainedNetwork):
             best, problem = self.best_scores(torch.sigmoid(torch.cat(logits).amax(dim=0)).tolist())
         scores = torch.sigmoid(torch.from_numpy(best_logits)).numpy()
         detections = apply_nms(boxes, scores, labels, self.classes, nms)
-        return DetectionResult(calibrated(detections, self.header.calibration), problem=problem,
-                               best=best)
+        return DetectionResult(calibrate_scores(detections, self.header.calibration),
+                               problem=problem, best=best)
 
     def _select_boxes(self, half_turn: bool, prediction: Prediction, min_scores: list[float],
                       max_boxes: int) -> Boxes:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from lidar_perception.detectors.matrix_kernel import BLOCK, LANES, packed, padded, padded_bias
-from lidar_perception.detectors.parallel import in_parts
+from lidar_perception.detectors.parallel import run_in_parts
 from lidar_perception.detectors.pointpillars import sparse_kernels as kernels
 from lidar_perception.detectors.pointpillars.network import FpnNeck, PointPillars, Prediction
 from lidar_perception.detectors.pointpillars.pillars import Pillars
@@ -221,7 +221,7 @@ def _computed(layer: Layer, maps: list[Map], chosen: np.ndarray, background: Map
             bias = bias[:0]
 
     cost = len(cells) * sum(weights.size for weights in layer.weights)
-    in_parts(compute, len(cells), cost // MIN_PER_PART)
+    run_in_parts(compute, len(cells), cost // MIN_PER_PART)
     return Map(index, rows)
 
 

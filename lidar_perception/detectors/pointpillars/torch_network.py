@@ -7,7 +7,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from lidar_perception.detectors.devices import CPU, number_format
+from lidar_perception.detectors.devices import CPU, choose_dtype
 from lidar_perception.detectors.pointpillars.network import PointPillars, Prediction, fused
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 from lidar_perception.detectors.pointpillars.sparse import SparseNetwork, unsupported
@@ -28,7 +28,7 @@ class TorchNetwork:
     """A PointPillars network with batch norms folded into its layers.
 
     Args:
-        amp: number format of the layers, see devices.number_format.
+        amp: number format of the layers, see devices.choose_dtype.
         engine: what runs the layers on the CPU: torch; sparse, see sparse.py; or auto, sparse if
             it can.
 
@@ -49,7 +49,7 @@ class TorchNetwork:
         device = pillars.points.device
         if self.sparse and device == CPU:
             return self.sparse(pillars, maps)
-        numbers = number_format(self.amp, device)
+        numbers = choose_dtype(self.amp, device)
         with torch.autocast(device.type, numbers, enabled=numbers is not None):
             features = self.network.features(pillars, maps).float()
         head = self.network.head
@@ -61,7 +61,7 @@ def _make_sparse(network: PointPillars, amp: str, engine: str) -> SparseNetwork 
     if engine == "torch":
         return None
     reason = unsupported(network)
-    if not reason and number_format(amp, CPU):
+    if not reason and choose_dtype(amp, CPU):
         reason = "it works in float32, and amp asks for 16 bits"
     if not reason:
         return SparseNetwork(network)

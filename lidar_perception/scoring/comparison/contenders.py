@@ -23,7 +23,13 @@ from lidar_perception.detectors.candidates import CandidateDetector
 from lidar_perception.detectors.checkpoint import NETWORKS, POINTNET
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.custom import CustomDetector
-from lidar_perception.detectors.open import FUSED, LOAD, Configured, kind_and_file, open_detector
+from lidar_perception.detectors.open import (
+    FUSED,
+    LOAD,
+    ConfigurableDetector,
+    open_detector,
+    resolve_weights,
+)
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file as pointnet_file
@@ -92,8 +98,8 @@ def contenders(weights: Sequence[Path] = (), device: str = "auto",
     """
     warm_up()
 
-    def opened_as(path: str | Path) -> Configured:
-        kind = kind_and_file(path)[0]
+    def opened_as(path: str | Path) -> ConfigurableDetector:
+        kind = resolve_weights(path)[0]
         return open_detector(path, device, sensor_height=sensor_height,
                              range="auto" if kind == POINTNET or kind not in LOAD else range,
                              settings=settings.get(kind, {}))

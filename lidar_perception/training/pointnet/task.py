@@ -267,7 +267,7 @@ def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches
         device: Device of the network.
         about: Description of the data for the header; a resumed run must have the same.
         commit: Version of the code for the header.
-        init: Checkpoint to start from, see checkpoint.adopt.
+        init: Checkpoint to start from, see checkpoint.copy_matching_weights.
     """
     torch.manual_seed(params.seed)
     network = load_initial_weights(make_pointnet(config), init, PointNetConfig).to(device)

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidar_perception.detectors.checkpoint import POINTPILLARS, network_of
+from lidar_perception.detectors.checkpoint import POINTPILLARS, read_network_name
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import make_pointnet
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file as pointpillars_file
-from lidar_perception.detectors.weights_file import existing
+from lidar_perception.detectors.weights_file import require_weights
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.data import Batches, Item, SceneReader, Stream
 from lidar_perception.training.params import PointNetTraining
@@ -52,8 +52,8 @@ def find_proposer(params: PointNetTraining) -> Path | None:
     """
     if params.proposer in ("", str(PACKAGE)):
         return pointpillars_file(PointPillarsParams()) if params.proposer else None
-    path = existing(params.proposer, "proposer")
-    if network_of(path) != POINTPILLARS:
+    path = require_weights(params.proposer, "proposer")
+    if read_network_name(path) != POINTPILLARS:
         raise InputError(f"{path} is no PointPillars, whose weights `proposer` names")
     return path
 

@@ -77,7 +77,7 @@ from lidar_perception.types import (
 
 # Boxes of low score hardly change the AP, and validation is quicker without them.
 VALIDATION_PARAMS = DetectorParams(pointpillars=PointPillarsParams(
-    scores=ScoreParams.all_alike(0.1), warm_up=False))
+    scores=ScoreParams.for_all_classes(0.1), warm_up=False))
 # Similar class: the class, such as Van: Car, Person_sitting: Pedestrian.
 CLASS_BY_SIMILAR = {other: name for name, other in NEIGHBOURS.items()}
 MIN_TOUCH_IOU = 1e-6  # of an anchor that touches a box
@@ -281,7 +281,7 @@ def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batc
         device: Device of the network.
         about: Description of the data for the header; a resumed run must have the same.
         commit: Version of the code for the header.
-        init: Checkpoint to start from, see checkpoint.adopt.
+        init: Checkpoint to start from, see checkpoint.copy_matching_weights.
     """
     torch.manual_seed(params.seed)
     network = load_initial_weights(make_network(config), init, NetworkConfig)
