@@ -45,11 +45,20 @@ def _is_kept(boxes, group, iou):
     kept = np.ones(len(boxes), np.bool_)
     reach, work = footprint_radii(boxes), np.empty((4, MAX_CORNERS))
     area = boxes[:, 3] * boxes[:, 4]
+    by_x = np.argsort(boxes[:, 0])
+    x, max_reach = boxes[by_x, 0], 0.0
+    for r in reach:
+        if r > max_reach:  # not NaN, as of boxes that overlap nothing
+            max_reach = r
     for i in range(len(boxes)):
-        if not kept[i]:
+        if not kept[i] or not reach[i] > 0:
             continue
-        for j in range(i + 1, len(boxes)):
-            if kept[j] and group[i] == group[j]:
+        far = reach[i] + max_reach
+        for place in range(np.searchsorted(x, boxes[i, 0] - far), len(x)):
+            if x[place] > boxes[i, 0] + far:
+                break
+            j = by_x[place]
+            if j > i and kept[j] and group[i] == group[j]:
                 shared = overlap_area(boxes[i], boxes[j], reach[i] + reach[j], work)
                 kept[j] = shared <= 0 or shared / (area[i] + area[j] - shared) <= iou
     return kept

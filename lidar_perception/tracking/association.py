@@ -1,21 +1,44 @@
-"""Assignment of detections to tracks: least total cost within gates."""
+"""Assignment of detections to tracks: least total cost within gates.
+
+The work grows with the number of pairs within their gates, not with tracks times detections.
+"""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numba import njit
 from scipy.optimize import linear_sum_assignment
 
-from lidar_perception.geometry import bev_iou
+from lidar_perception.geometry import MAX_CORNERS, footprint_radii, overlap_area
 from lidar_perception.tracking.params import NOMINAL_PERIOD_S, AssociationParams
 
-FORBIDDEN = 1e3  # far more than all allowed pairs cost together
+FORBIDDEN = 1e5  # more than all allowed pairs cost together
 MAX_COST = 1.0
 
 
-def compute_costs(tracks: np.ndarray, spread: np.ndarray, kinds: np.ndarray, reach: np.ndarray,
-                  boxes: np.ndarray, box_kinds: np.ndarray, params: AssociationParams,
-                  seconds: float = NOMINAL_PERIOD_S) -> np.ndarray:
-    """Compute the cost of assigning each detection to each track.
+class Pairs(NamedTuple):
+    """Allowed pairs of tracks and detections, ordered by track and detection.
+
+    Attributes:
+        tracks, boxes: (P,) indices.
+        costs: (P,) float64, at most MAX_COST.
+    """
+
+    tracks: np.ndarray
+    boxes: np.ndarray
+    costs: np.ndarray
+
+    def select(self, wanted: np.ndarray) -> Pairs:
+        """Return the pairs at wanted (P,) bool or indices."""
+        return Pairs(*(column[wanted] for column in self))
+
+
+def find_pairs(tracks: np.ndarray, spread: np.ndarray, kinds: np.ndarray, reach: np.ndarray,
+               boxes: np.ndarray, box_kinds: np.ndarray, params: AssociationParams,
+               seconds: float = NOMINAL_PERIOD_S) -> Pairs:
+    """Find the detections that can belong to each track, and the cost of assigning them.
 
     Args:
         tracks: (N, 7) predicted boxes.
@@ -25,30 +48,100 @@ def compute_costs(tracks: np.ndarray, spread: np.ndarray, kinds: np.ndarray, rea
         boxes: (M, 7) detected boxes in the frame of tracks.
         box_kinds: (M,) indices in KINDS.
         seconds: time since the previous frame.
-
-    Returns:
-        (N, M) float64: at most MAX_COST where the detection can belong to the track, else
-        FORBIDDEN.
     """
-    dx, dy = (tracks[:, None, axis] - boxes[None, :, axis] for axis in (0, 1))
-    distance = np.sqrt(dx * dx + dy * dy)
     widest = params.max_gate * max(1.0, seconds / NOMINAL_PERIOD_S)
-    gate = np.minimum(np.maximum(params.sigmas * spread, reach), widest)[:, None]
-    cost = (1.0 - params.overlap) * distance / gate
+    gate = np.minimum(np.maximum(params.sigmas * spread, reach), widest)
+    order = np.argsort(boxes[:, 0], kind="stable")
+    i, j, distance, iou = _find_pairs_in_gates(np.ascontiguousarray(tracks), gate,
+                                               np.ascontiguousarray(boxes), order,
+                                               params.overlap > 0)
+    cost = (1.0 - params.overlap) * distance / gate[i]
     if params.overlap > 0:
-        cost += params.overlap * (1.0 - bev_iou(tracks, boxes))
-    differ = kinds[:, None] != box_kinds[None, :]
-    if differ.any():
-        on_foot_or_cycle = (kinds > 0)[:, None] & (box_kinds > 0)[None, :]
-        cost += params.other_kind * differ * np.where(on_foot_or_cycle, 0.5, 1.0)
-    return np.where((distance <= gate) & (cost <= MAX_COST), cost, FORBIDDEN)
+        cost += params.overlap * (1.0 - iou)
+    differ = kinds[i] != box_kinds[j]
+    on_foot_or_cycle = (kinds[i] > 0) & (box_kinds[j] > 0)
+    cost += params.other_kind * differ * np.where(on_foot_or_cycle, 0.5, 1.0)
+    allowed = np.flatnonzero(cost <= MAX_COST)
+    return Pairs(i, j, cost).select(allowed[np.lexsort((j[allowed], i[allowed]))])
 
 
-def assign(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pair rows and columns of cost (N, M): as many allowed pairs as possible, then least cost.
+@njit(cache=True, nogil=True)
+def _find_pairs_in_gates(tracks, gate, boxes, order, with_iou):
+    """Return tracks, boxes, distances and BEV IoU (P,) of the pairs whose distance is within the
+    gate; order (M,) are the indices of the boxes by x."""
+    x = boxes[order, 0]
+    reach, box_reach = footprint_radii(tracks), footprint_radii(boxes)
+    work = np.empty((4, MAX_CORNERS))
+    i, j, distances, ious = [0], [0], [0.0], [0.0]  # the first item gives the types
+    for track in range(len(tracks)):
+        a = tracks[track]
+        # Slightly wider, so that rounding loses no pair at the gate.
+        margin = gate[track] + 1e-9 * (abs(a[0]) + gate[track])
+        for place in range(np.searchsorted(x, a[0] - margin), len(x)):
+            if x[place] > a[0] + margin:
+                break
+            b = boxes[order[place]]
+            dx, dy = a[0] - b[0], a[1] - b[1]
+            distance = np.sqrt(dx * dx + dy * dy)
+            if distance <= gate[track]:
+                shared = 0.0
+                if with_iou:
+                    shared = overlap_area(a, b, reach[track] + box_reach[order[place]], work)
+                i.append(track)
+                j.append(order[place])
+                distances.append(distance)
+                ious.append(shared / (a[3] * a[4] + b[3] * b[4] - shared) if shared > 0 else 0.0)
+    return np.array(i)[1:], np.array(j)[1:], np.array(distances)[1:], np.array(ious)[1:]
 
-    Returns the rows (P,), ascending, and their columns (P,).
+
+def assign(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
+    """Assign detections to tracks: as many as possible, then at least total cost.
+
+    Returns the tracks (P,), ascending, and their detections (P,).
     """
-    rows, columns = linear_sum_assignment(cost)
-    allowed = cost[rows, columns] < FORBIDDEN
-    return rows[allowed], columns[allowed]
+    part = _label_parts(pairs.tracks, pairs.boxes)
+    single = np.bincount(part)[part] == 1
+    chosen = [np.flatnonzero(single)]
+    rest = np.flatnonzero(~single)
+    rest = rest[np.argsort(part[rest], kind="stable")]
+    for group in np.split(rest, np.flatnonzero(np.diff(part[rest])) + 1):
+        if len(group):
+            chosen.append(group[_assign_part(pairs.select(group))])
+    found = np.sort(np.concatenate(chosen))
+    return pairs.tracks[found], pairs.boxes[found]
+
+
+@njit(cache=True, nogil=True)
+def _label_parts(tracks, boxes):
+    """Label pairs (P,) that are connected by common tracks or boxes: the smallest index of such a
+    pair, (P,) int64."""
+    parent = np.arange(len(tracks))
+    for nodes in (tracks, boxes):
+        first = np.full(nodes.max() + 1 if len(nodes) else 0, -1)  # the first pair of each node
+        for pair in range(len(nodes)):
+            if first[nodes[pair]] < 0:
+                first[nodes[pair]] = pair
+            one, other = _root(parent, first[nodes[pair]]), _root(parent, pair)
+            parent[max(one, other)] = min(one, other)
+    for pair in range(len(tracks)):
+        parent[pair] = _root(parent, pair)
+    return parent
+
+
+@njit(cache=True, nogil=True)
+def _root(parent, node):
+    while parent[node] != node:
+        parent[node] = parent[parent[node]]
+        node = parent[node]
+    return node
+
+
+def _assign_part(pairs: Pairs) -> np.ndarray:
+    """Return the indices of the chosen pairs among connected ones."""
+    tracks, i = np.unique(pairs.tracks, return_inverse=True)
+    boxes, j = np.unique(pairs.boxes, return_inverse=True)
+    cost = np.full((len(tracks), len(boxes)), FORBIDDEN)
+    index = np.full(cost.shape, -1)
+    cost[i, j], index[i, j] = pairs.costs, np.arange(len(i))
+    found = index[linear_sum_assignment(cost)]
+    return found[found >= 0]

@@ -12,7 +12,7 @@ from scipy.special import ndtr
 
 from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.tracking import existence, motion
-from lidar_perception.tracking.association import FORBIDDEN, assign, compute_costs
+from lidar_perception.tracking.association import assign, find_pairs
 from lidar_perception.tracking.params import KIND_OF_CLASS, TrackingParams
 from lidar_perception.tracking.state import States
 from lidar_perception.types import CLASSES, PEDESTRIAN
@@ -58,12 +58,11 @@ def match(states: States, boxes: np.ndarray, class_ids: np.ndarray, scores: np.n
     noise = _collect_by_kind(params, "position")[kinds]
     spread = np.sqrt(np.maximum(states.covariances[:, 0, 0], states.covariances[:, 1, 1])
                      + noise * noise)
-    cost = compute_costs(states.to_boxes(), spread, kinds, _collect_by_kind(params, "reach")[kinds],
-                         boxes, KIND_IDS[class_ids], params.association, seconds)
-    strong = scores >= params.association.strong
-    i, j = assign(np.where(strong, cost, FORBIDDEN))
-    cost[i] = FORBIDDEN
-    rest, weak = assign(np.where(strong, FORBIDDEN, cost))
+    pairs = find_pairs(states.to_boxes(), spread, kinds, _collect_by_kind(params, "reach")[kinds],
+                       boxes, KIND_IDS[class_ids], params.association, seconds)
+    strong = (scores >= params.association.strong)[pairs.boxes]
+    i, j = assign(pairs.select(strong))
+    rest, weak = assign(pairs.select(~strong & ~np.isin(pairs.tracks, i)))
     return np.concatenate([i, rest]), np.concatenate([j, weak])
 
 

@@ -26,6 +26,7 @@ from lidar_perception.detectors.pointpillars.targets import (
     nearest_axis_iou,
     sparse,
 )
+from lidar_perception.geometry import bev_iou
 
 seeds = st.integers(0, 2**32 - 1)
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -255,3 +256,18 @@ def test_suppression_is_that_of_a_slow_loop(seed, across):
     if sure:
         assert rotated_nms(boxes, scores, labels, limit, across).tolist() == kept
     assert rotated_nms(boxes[:0], scores[:0], labels[:0], limit).tolist() == []
+
+
+def test_suppression_of_many_boxes_of_all_sizes_is_that_of_all_pairs():
+    """A long box reaches far; boxes without area or position overlap nothing and stay."""
+    rng = np.random.default_rng(0)
+    boxes = some_boxes(0, 200, spread=20)
+    boxes[:5, 3], boxes[5:8, 4], boxes[8:11, 0], boxes[11, 1] = 30.0, 0.0, np.nan, np.inf
+    scores = rng.permutation(200) / 200
+    above = bev_iou(boxes, boxes) > 0.05
+    kept: list[int] = []
+    for i in np.argsort(-scores):
+        if not above[i, kept].any():
+            kept.append(int(i))
+    assert 20 < len(kept) < 190 and {*range(5, 12)} < {*kept}
+    assert rotated_nms(boxes, scores, np.zeros(200, int), 0.05).tolist() == kept

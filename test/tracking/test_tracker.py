@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 from tracking_samples import CAR, CYCLIST, START, TENTH, car, cars, crowd, person, pose
 
-from lidar_perception.geometry import wrap_angle
+from lidar_perception.geometry import bev_iou, wrap_angle
 from lidar_perception.param_fields import with_values
 from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.robot.poses import transform_boxes
-from lidar_perception.tracking.association import FORBIDDEN, assign, compute_costs
+from lidar_perception.tracking.association import assign, find_pairs
 from lidar_perception.tracking.ego import Ego, advance_ego, is_valid_pose
 from lidar_perception.tracking.existence import discount_observations
 from lidar_perception.tracking.params import AssociationParams, TrackingParams
@@ -278,11 +279,38 @@ def test_assignment_maximizes_pairs_within_gates():
     tracks = np.array([car(0), car(2), car(100)])
     found = np.array([car(1.2), car(-0.4), car(50)])
     kinds = np.zeros(3, int)
-    cost = compute_costs(tracks, np.full(3, 0.3), kinds, np.full(3, 1.5), found, kinds,
-                 AssociationParams())
-    assert (cost[2] == FORBIDDEN).all() and (cost[:, 2] == FORBIDDEN).all()
-    assert [p.tolist() for p in assign(cost)] == [[0, 1], [1, 0]]
-    assert len(assign(np.zeros((0, 4)))[0]) == 0
+    pairs = find_pairs(tracks, np.full(3, 0.3), kinds, np.full(3, 1.5), found, kinds,
+                       AssociationParams())
+    assert {2} & {*pairs.tracks.tolist(), *pairs.boxes.tolist()} == set()
+    assert [p.tolist() for p in assign(pairs)] == [[0, 1], [1, 0]]
+    none = find_pairs(np.zeros((0, 7)), *[np.zeros(0, int)] * 3, found, kinds, AssociationParams())
+    assert [len(p) for p in assign(none)] == [0, 0]
+
+
+@pytest.mark.parametrize(("count", "overlap"), [(1, 0.5), (40, 0.5), (40, 0.0), (150, 1.0)])
+def test_sparse_assignment_equals_dense_one(count, overlap):
+    """Reference: costs of all tracks with all detections, and one assignment of all."""
+    rng, params = np.random.default_rng(count), AssociationParams(overlap=overlap)
+    extent = 2.5 * np.sqrt(count)
+    tracks = np.column_stack([rng.uniform(0, extent, (count, 2)), np.zeros(count),
+                              rng.uniform(0.5, 4, (count, 3)), rng.uniform(-4, 4, count)])
+    found = tracks[rng.permutation(count)] + rng.normal(0, 0.5, (count, 7)) * [1, 1, 0, 0, 0, 0, 1]
+    found = np.concatenate([found, tracks[:1] + 0.1])
+    kinds, box_kinds = rng.integers(0, 3, count), rng.integers(0, 3, count + 1)
+    spread, reach = rng.uniform(0.1, 1.0, count), np.full(count, 1.5)
+    distance = np.linalg.norm(tracks[:, None, :2] - found[None, :, :2], axis=-1)
+    gate = np.clip(params.sigmas * spread, reach, params.max_gate)[:, None]
+    cost = (1 - overlap) * distance / gate + overlap * (1 - bev_iou(tracks, found))
+    differ = kinds[:, None] != box_kinds
+    cost += params.other_kind * differ * np.where((kinds[:, None] > 0) & (box_kinds > 0), 0.5, 1)
+    cost[(distance > gate) | (cost > 1)] = 1e5
+    rows, columns = linear_sum_assignment(cost)
+    allowed = cost[rows, columns] < 1e5
+    pairs = find_pairs(tracks, spread, kinds, reach, found, box_kinds, params)
+    assert len(pairs.costs) == (cost < 1e5).sum()
+    np.testing.assert_allclose(pairs.costs, cost[pairs.tracks, pairs.boxes], atol=1e-12)
+    i, j = assign(pairs)
+    assert (i.tolist(), j.tolist()) == (rows[allowed].tolist(), columns[allowed].tolist())
 
 
 def test_parked_cars_keep_ids_from_turning_car_without_poses():
