@@ -40,7 +40,7 @@ def compare_candidates(frames: list[Frame], repeat: int) -> dict:
         # The same ground for both: then clusters must be identical, and so the candidates.
         ids = cluster_obstacles(result["points"], result["ground"], PAPER.clustering)
         agree["labels_identical"] += np.array_equal(ids, result["labels"])
-        boxes = fit_grounded_boxes(result["points"], result["ground"], ids, "axis_aligned")
+        boxes = fit_grounded_boxes(result["points"], result["ground"], ids)
         segmented = SegmentedCloud(np.arange(len(ids)), result["points"], result["ground"], ids,
                                    boxes)
         found = refine_segmented(segmented, make_truth_source(truth), PAPER)

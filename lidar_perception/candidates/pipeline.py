@@ -58,7 +58,7 @@ def segment_cloud(cloud: PointCloud | ArrayLike, camera: Camera | None = None,
     else:
         cluster_ids, numbers = renumber_ids(np.asarray(cluster_ids)[indices])
     t3 = perf_counter()
-    boxes = fit_grounded_boxes(seen.xyz, ground, cluster_ids, params.boxes.shape)
+    boxes = fit_grounded_boxes(seen.xyz, ground, cluster_ids, params.boxes)
     t4 = perf_counter()
     ms = dict(view=t1 - t0, ground=t2 - t1, clustering=t3 - t2, boxes=t4 - t3)
     return SegmentedCloud(indices, seen.xyz, ground, cluster_ids, boxes, numbers,

@@ -8,8 +8,10 @@ import numpy as np
 
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.boxes import snap_to_ground
+from lidar_perception.clustering.params import BoxParams
 from lidar_perception.clustering.shapes import fit_boxes
-from lidar_perception.ground.threshold import fit_plane
+from lidar_perception.ground.params import ThresholdParams
+from lidar_perception.ground.threshold import fit_plane, fit_plane_by_ransac
 from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
@@ -35,13 +37,17 @@ class SegmentedCloud:
 
 
 def fit_grounded_boxes(xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray,
-                       shape: str) -> np.ndarray:
-    """Fit boxes (K, 7) to clusters 1..K, down to the plane through the ground points.
+                       params: BoxParams = BoxParams()) -> np.ndarray:
+    """Fit boxes (K, 7) to clusters 1..K, down to the plane through the ground points."""
+    plane = fit_ground_plane(xyz.compress(ground, axis=0), params)
+    return snap_to_ground(fit_boxes(xyz, cluster_ids, params.shape), plane)
 
-    shape is one of clustering.params.BOX_SHAPES.
-    """
-    return snap_to_ground(fit_boxes(xyz, cluster_ids, shape),
-                          fit_plane(xyz.compress(ground, axis=0)))
+
+def fit_ground_plane(ground: np.ndarray, params: BoxParams) -> np.ndarray | None:
+    """Fit the plane (3,) under the boxes to ground points (M, 3), None if there is none."""
+    if params.plane == "ransac":
+        return fit_plane_by_ransac(ground, ThresholdParams())
+    return fit_plane(ground)
 
 
 def diagnose_empty(usable: int, ground: np.ndarray,

@@ -79,3 +79,6 @@ class BoxParams(Params):
     shape: str = param("axis_aligned", "axis_aligned: along x and y (STM-CPA paper). min_area: the "
                        "smallest rectangle. l_shape: along the two visible sides.",
                        choices=BOX_SHAPES)
+    plane: str = param("least_squares", "Plane down to which the boxes reach. least_squares: of "
+                       "all ground points. ransac: of most of them (STM-CPA paper).",
+                       choices=("least_squares", "ransac"))

@@ -32,6 +32,9 @@ class ThresholdParams(Params):
                               "paper's z < -1.3.", unit="m", low=-10.0, high=100.0)
     inlier_distance: float = param(0.1, "A point this near the plane, vertically, is ground.",
                                    unit="m", low=0.001, high=2.0)
+    separate: str = param("plane", "plane: points near the plane are ground. height: all points "
+                          "below max_height are, as in the STM-CPA paper.",
+                          choices=("plane", "height"))
     max_iterations: int = param(2000, "RANSAC trials at most; it stops as soon as another trial "
                                 "would hardly help.", low=1, high=100_000)
     max_slope: float = param(30.0, "Planes steeper than this are not ground.", unit="deg",

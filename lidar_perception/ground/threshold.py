@@ -23,10 +23,12 @@ def segment_by_threshold(xyz: np.ndarray, params: ThresholdParams = ThresholdPar
     """Segment the ground of finite points (N, 3).
 
     Returns:
-        (N,) bool, True = ground: points within inlier_distance of the plane of most points lower
-        than max_height above the ground at the sensor. All False if there is no such plane (too
-        few points, or too steep).
+        (N,) bool, True = ground. separate = "plane": points within inlier_distance of the plane of
+        most points lower than max_height above the ground at the sensor; all False if there is no
+        such plane (too few points, or too steep). separate = "height": these low points.
     """
+    if params.separate == "height":
+        return _is_low(xyz, params, sensor_height)
     plane = find_plane(xyz, params, sensor_height)
     if plane is None:
         return np.zeros(len(xyz), bool)
@@ -39,9 +41,12 @@ def find_plane(xyz: np.ndarray, params: ThresholdParams = ThresholdParams(),
 
     It is found among the low points and fitted to all points near it.
     """
-    low = xyz[:, 2] < params.max_height - sensor_height
-    plane = _run_trials(xyz.compress(low, axis=0), params)
+    plane = _run_trials(xyz.compress(_is_low(xyz, params, sensor_height), axis=0), params)
     return None if plane is None else refine_plane(xyz, plane, params)
+
+
+def _is_low(xyz: np.ndarray, params: ThresholdParams, sensor_height: float) -> np.ndarray:
+    return xyz[:, 2] < params.max_height - sensor_height
 
 
 def fit_plane_by_ransac(xyz: np.ndarray, params: ThresholdParams) -> np.ndarray | None:

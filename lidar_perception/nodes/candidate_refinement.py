@@ -46,6 +46,6 @@ class CandidateRefinement(ManagedNode):
             ground = np.zeros(len(ids), bool) if ground is None else ground > 0
             segmented = SegmentedCloud(indices, frame.xyz, ground, ids,
                                        fit_grounded_boxes(frame.xyz, ground, ids,
-                                                          self.params.boxes.shape), numbers)
+                                                          self.params.boxes), numbers)
             self.outputs.publish(msg.header, frame.xyz,
                                  lambda: refine_segmented(segmented, source, self.params))

@@ -45,7 +45,7 @@ class Clustering(ManagedNode):
             self.points.publish(encode(add_columns(
                 msg, bag_message, cluster_id=scatter_values(ids, indices, msg, "u4"))))
         self.boxes.publish(msg.header, lambda: fit_grounded_boxes(
-            frame.xyz, ground, ids, self.params.boxes.shape))
+            frame.xyz, ground, ids, self.params.boxes))
         self.counts["clusters"] = int(ids.max(initial=0))
         if column is None:
             self.report(WARN, "the cloud has no column 'ground', so all points are clustered; "

@@ -12,12 +12,11 @@ from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.refine import STAGES, Candidates, refine_clusters
 from lidar_perception.candidates.seeds import Seed
-from lidar_perception.candidates.segmented_cloud import SegmentedCloud
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud, fit_ground_plane
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import bev_and_3d_iou
-from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.reproduction.experiment import Experiment
 from lidar_perception.reproduction.labelled import load_labelled, nearest_seed
@@ -88,7 +87,7 @@ def search(segmented: SegmentedCloud, seed: Seed | None,
     each min_samples: eps in all bands of range, which are clustered one by one as in the paper.
 
     Hits lie within search_distance (Section 4.2)."""
-    plane = fit_plane(segmented.xyz.compress(segmented.ground, axis=0))
+    plane = fit_ground_plane(segmented.xyz.compress(segmented.ground, axis=0), PAPER.boxes)
     counts = []
     for eps in NUMBERS.search_eps:
         for min_samples in NUMBERS.search_min_samples:

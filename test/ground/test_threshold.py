@@ -208,3 +208,10 @@ def test_the_result_is_repeatable_and_the_input_not_modified():
     first = segment_by_threshold(xyz)
     np.testing.assert_array_equal(segment_by_threshold(xyz), first)
     np.testing.assert_array_equal(xyz, before)
+
+
+@given(st.integers(0, 2**31), slopes, slopes)
+def test_height_threshold_removes_all_low_points(seed, a, b):
+    xyz = sloped_scene(seed, [a, b, -1.7])
+    np.testing.assert_array_equal(segment_by_threshold(xyz, ThresholdParams(separate="height")),
+                                  xyz[:, 2] < np.float32(-1.3))
