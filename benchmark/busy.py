@@ -19,7 +19,7 @@ from benchmark.rows import measured, row
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.runs.memory import keep_freed_memory
 from lidar_perception.runs.terminal import show_progress
-from lidar_perception.runs.threads import PASSIVE_WAITING
+from lidar_perception.runs.threads import PASSIVE_WAITING, set_thread_count
 from lidar_perception.types import PointCloud
 
 BUSY = 2  # other processes
@@ -68,9 +68,8 @@ _ready: dict = {}  # in a worker
 
 
 def _prepare(scans: list[PointCloud]) -> None:
-    import torch
     keep_freed_memory()
-    torch.set_num_threads(len(os.sched_getaffinity(0)))  # as the nodes do
+    set_thread_count(len(os.sched_getaffinity(0)))  # as the nodes do
     _ready.update(detector=open_detector("pointpillars"), scans=scans)
 
 

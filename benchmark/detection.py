@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 from rich.table import Table
+from scipy.special import expit
 
 from benchmark.rows import against, measured
 from benchmark.timing import Clock, evenly_chosen
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import FUSED, DetectionResult
-from lidar_perception.detectors.devices import find_device
+from lidar_perception.detectors.devices import CPU, find_device
 from lidar_perception.detectors.open import POINTPILLARS, open_detector
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS, network_config
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
@@ -27,6 +28,7 @@ from lidar_perception.detectors.pointpillars.proposer import PointPillarsPropose
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.runs.machine import read_cpu_name
 from lidar_perception.runs.terminal import console, show_progress
+from lidar_perception.runs.threads import set_thread_count, thread_count
 from lidar_perception.types import PointCloud
 
 PAPER_TO_V0 = {"v0": 1.0, "v1": 1.06, "v2": 1.86, "v3": 2.48, "v4": 3.54}  # paper B, RTX 4090
@@ -41,10 +43,10 @@ def measure_detection(scans: list[PointCloud], repeat: int,
     are random: time depends on them only by what passes the thresholds, which are set to let
     CANDIDATES anchors through."""
     device = find_device()
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else read_cpu_name()
-    content: dict[str, Any] = {"device": name, "threads": torch.get_num_threads(), "sizes": {}}
+    name = torch.cuda.get_device_name(device) if device != CPU else read_cpu_name()
+    content: dict[str, Any] = {"device": name, "threads": thread_count(), "sizes": {}}
     for size in sizes:
-        chosen = evenly_chosen(scans, FEW) if (size, device.type) == ("full", "cpu") else scans
+        chosen = evenly_chosen(scans, FEW) if (size, device) == ("full", CPU) else scans
         detectors = {version: _random_detector(version, size, device, chosen[0])
                      for version in VERSIONS}
         content["sizes"][size] = {
@@ -75,11 +77,13 @@ def _medians(detectors: dict[str, PointPillarsDetector], scans: list[PointCloud]
 class Heard:
     """A network that keeps its last logits (A, K)."""
 
+    has_fixed_range = True
+
     def __init__(self, network: TorchNetwork):
         self.network = network
-        self.logits: torch.Tensor | None = None
+        self.logits: np.ndarray | None = None
 
-    def to(self, device: torch.device) -> None:
+    def to(self, device: str) -> None:
         """As Network."""
         self.network.to(device)
 
@@ -89,7 +93,7 @@ class Heard:
         return prediction
 
 
-def _random_detector(version: str, size: str, device: torch.device,
+def _random_detector(version: str, size: str, device: str,
                      scan: PointCloud) -> PointPillarsDetector:
     """Warmed up, with thresholds that CANDIDATES anchors pass in this scan."""
     config = network_config(version, size)
@@ -99,8 +103,8 @@ def _random_detector(version: str, size: str, device: torch.device,
     detector.warm_up()
     detector(scan)
     assert heard.logits is not None
-    best = torch.sigmoid(heard.logits.amax(dim=1))
-    least = float(best.topk(min(CANDIDATES, len(best))).values[-1])
+    best = np.sort(expit(heard.logits.max(axis=1)))
+    least = float(best[-min(CANDIDATES, len(best))])
     detector = detector.with_min_score(least)
     detector.proposer.network = heard.network
     detector(scan)
@@ -129,8 +133,8 @@ def measure_engines(scans: list[PointCloud], repeat: int,
                     detectors: Sequence[str] = (POINTPILLARS, FUSED)) -> dict:
     """Compare the engines torch and sparse of PointPillars with the weights of the package: median
     CPU time of one thread, in turns. `same` counts scans with the same detections."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    threads = thread_count()
+    set_thread_count(1)
     rows = []
     for weights in detectors:
         for range_ in "ahead", "around":
@@ -145,7 +149,7 @@ def measure_engines(scans: list[PointCloud], repeat: int,
                 same += _same(found["torch"], found["ours"])
             ms = clock.medians()
             rows.append(against(name, {name: ms["torch"], "ours": ms["ours"]}, same=same))
-    torch.set_num_threads(threads)
+    set_thread_count(threads)
     title = f"Sparse engine, CPU ms of one thread at a load of {os.getloadavg()[0]:.1f}"
     return measured(title, len(scans), np.median([len(scan) for scan in scans]), rows)
 

@@ -20,8 +20,10 @@ from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointnet.network import fused, make_pointnet
 from lidar_perception.detectors.pointnet.params import STEPS
 from lidar_perception.detectors.pointnet.predict import predict
+from lidar_perception.detectors.pointnet.torch_network import TorchPointNet
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.runs.terminal import console
+from lidar_perception.runs.threads import thread_count
 from lidar_perception.types import PointCloud
 
 COUNT = 100                  # clusters
@@ -33,10 +35,11 @@ def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
     and read COUNT clusters of a scan, or as many as it has."""
     torch.manual_seed(0)
     config = pointnet_config()
-    networks = {name: fused(make_pointnet(pointnet_config(name)))
+    networks = {name: TorchPointNet(fused(make_pointnet(pointnet_config(name))))
                 for name in ("improved", "pointnet2", "pointnet")}
     plain = PlainPointNet2(config).eval()
-    detector = PointNetDetector(PointNetClassifier(make_pointnet(config), Header(config)))
+    detector = PointNetDetector(PointNetClassifier(
+        TorchPointNet(fused(make_pointnet(config)), "auto"), Header(config)))
     detector.warm_up()
     rows, steps, counts = [], [], []
     for scan in scans:
@@ -53,7 +56,7 @@ def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
         counts.append((len(some), len(every), len(scan)))
     middle = np.median(counts, axis=0)
     return {"clusters": float(middle[0]), "all_clusters": float(middle[1]),
-            "points": float(middle[2]), "threads": torch.get_num_threads(), "scans": len(rows),
+            "points": float(middle[2]), "threads": thread_count(), "scans": len(rows),
             "ms": {name: float(np.median([row[name] for row in rows])) for name in rows[0]},
             "steps": dict(zip(STEPS, np.median(steps, axis=0).tolist()))}
 

@@ -86,10 +86,12 @@ def carrier_too(monkeypatch):
 def one_thread():
     """torch with one thread: small networks are slower with more, and wait for busy cores."""
     import torch
+
+    from lidar_perception.runs.threads import set_thread_count
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    set_thread_count(1)
     yield
-    torch.set_num_threads(before)
+    set_thread_count(before)
 
 
 @pytest.fixture(scope="module")
@@ -97,10 +99,12 @@ def one_thread_for_all():
     """As one_thread, for fixtures of the module too: runs are compared bit by bit, and other
     numbers of threads may add in another order."""
     import torch
+
+    from lidar_perception.runs.threads import set_thread_count
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    set_thread_count(1)
     yield
-    torch.set_num_threads(before)
+    set_thread_count(before)
 
 
 @pytest.fixture(scope="session")

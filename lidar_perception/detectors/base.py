@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
-import torch
 
 from lidar_perception.detectors.contract import Cloud, DetectionResult, accept, join_problems
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
@@ -63,8 +62,8 @@ class NetworkDetector:
         return getattr(self.params, self.group)
 
     @property
-    def device(self) -> torch.device:
-        """Device of the first network."""
+    def device(self) -> str:
+        """Device that the first network runs on now: cpu, cuda or cuda:N."""
         return self.networks[0].device
 
     @property

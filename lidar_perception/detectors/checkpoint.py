@@ -1,4 +1,7 @@
-"""Checkpoints of all networks: safetensors files with a JSON header that describes the network."""
+"""Checkpoints of all networks: safetensors files with a JSON header that describes the network.
+
+Only functions that take or return a network of torch load torch.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,13 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
-import torch
+import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 
 from lidar_perception.detectors.config_json import parse_config
+from lidar_perception.detectors.layer_weights import Misfit
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.runs.files import write_bytes
@@ -24,7 +27,10 @@ FORMAT = 1
 MAX_COEFFICIENT = 100.0  # of slopes and offsets of a calibration
 MIN_HEIGHT_DIFFERENCE_M = 0.3  # smaller differences in mounting height need no warning
 
-Net = TypeVar("Net", bound=torch.nn.Module)
+if TYPE_CHECKING:
+    import torch
+
+Net = TypeVar("Net", bound="torch.nn.Module")
 
 
 class Config(Protocol):
@@ -161,16 +167,19 @@ def save_checkpoint(path: str | Path, network: torch.nn.Module, header: Header,
     Args:
         half: store the weights of layers as float16; norms and biases remain float32.
     """
+    from safetensors.torch import save
     tensors = {name: _to_stored(value, half) for name, value in network.state_dict().items()}
     write_bytes(path, save(tensors, {KEY: header.to_json()}))
 
 
 def save_header(path: Path, header: Header) -> None:
     """Replace the header of a checkpoint and leave its tensors unchanged."""
+    from safetensors.torch import save
     write_bytes(path, save(_read(path)[1], {KEY: header.to_json()}))
 
 
 def _to_stored(value: torch.Tensor, half: bool) -> torch.Tensor:
+    import torch
     value = value.detach().cpu()
     if value.is_floating_point():
         value = value.to(torch.float16 if half and value.ndim > 1 else torch.float32)
@@ -196,6 +205,20 @@ def read_checkpoint(path: str | Path,
     return Header.from_json(text, str(path), kind), tensors
 
 
+def read_arrays(path: str | Path, kind: type[Config]) -> tuple[Header, dict[str, np.ndarray]]:
+    """Read the header and the tensors as stored, without loading torch.
+
+    Raises:
+        InputError: see read_header.
+        Misfit: a tensor has a number format that NumPy lacks, such as bf16.
+    """
+    try:
+        text, tensors = _read(Path(path), framework="np")
+    except (TypeError, AttributeError) as error:  # of safetensors
+        raise Misfit(str(error)) from None
+    return Header.from_json(text, str(path), kind), tensors
+
+
 def load_checkpoint(path: str | Path, kind: type[Config], make: Callable[[Any], Net],
                     expected: Any = None) -> tuple[Header, Net]:
     """Load the header and the network of a checkpoint: float32, on the CPU, in training mode.
@@ -208,6 +231,7 @@ def load_checkpoint(path: str | Path, kind: type[Config], make: Callable[[Any], 
     Raises:
         InputError: see read_header and require_same_config; or the weights do not fit the config.
     """
+    import torch
     header, tensors = read_checkpoint(path, kind)
     if expected is not None:
         require_same_config(header.config, expected, str(path))
@@ -279,12 +303,17 @@ def require_same_config(found: Any, wanted: Any, source: str) -> None:
         raise InputError(f"{source} holds another network: {shown}")
 
 
-def _read(path: Path, tensors: bool = True) -> tuple[str | None, dict[str, torch.Tensor]]:
-    """Return the text of the header, None if there is none, and the tensors."""
+def _read(path: Path, tensors: bool = True, framework: str = "pt"
+          ) -> tuple[str | None, dict[str, Any]]:
+    """Return the text of the header, None if there is none, and the tensors.
+
+    Args:
+        framework: of the tensors, pt for torch or np for NumPy.
+    """
     if not path.is_file():
         raise InputError(f"there is no checkpoint {path}")
     try:
-        with safe_open(path, "pt") as opened:
+        with safe_open(path, framework if tensors else "np") as opened:
             text = (opened.metadata() or {}).get(KEY)
             names = opened.keys() if tensors and text else ()
             return text, {name: opened.get_tensor(name) for name in names}

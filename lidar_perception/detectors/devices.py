@@ -1,49 +1,80 @@
-"""Device and number format of a network."""
+"""Where a network runs, the CPU or CUDA, and in which number format.
+
+A device is its name, such as cpu or cuda:1. torch is loaded only where a GPU may be in use.
+"""
 
 from __future__ import annotations
 
-import torch
+import ctypes
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lidar_perception.runs.machine import has_bf16
 from lidar_perception.types import InputError
 
-CPU = torch.device("cpu")
-FORMATS = {"bf16": torch.bfloat16, "fp16": torch.float16}
+if TYPE_CHECKING:
+    import torch
+
+CPU = "cpu"
 
 
-def find_device(name: str = "auto") -> torch.device:
-    """Return the torch device for 'auto', 'cpu', 'cuda' or 'cuda:N'.
+def find_device(name: str = "auto") -> str:
+    """Return the device of 'auto', 'cpu', 'cuda' or 'cuda:N'.
 
     Raises:
-        InputError: the name is unknown, or the machine has no such device.
+        InputError: there is no such device.
     """
+    if name == CPU or (name == "auto" and not _has_gpu_driver()):
+        return CPU
+    match = re.fullmatch(r"auto|cuda(?::(\d+))?", name)
+    if not match:
+        raise InputError(f"there is no device {name!r}; choose auto, cpu, cuda or cuda:N")
+    import torch  # takes seconds
     available = torch.cuda.is_available()
     if name == "auto":
-        return torch.device("cuda" if available else "cpu")
-    try:
-        device = torch.device(name)
-        if device.type not in ("cpu", "cuda"):
-            raise RuntimeError
-    except RuntimeError:
-        raise InputError(f"there is no device {name!r}; choose auto, cpu, cuda or cuda:N") from None
-    if device.type == "cuda" and not (available and (device.index or 0)
-                                      < torch.cuda.device_count()):
+        return "cuda" if available else CPU
+    if not (available and int(match[1] or 0) < torch.cuda.device_count()):
         raise InputError(f"device {name!r} is not available: torch finds "
                          f"{torch.cuda.device_count() if available else 'no'} CUDA device here; "
                          "choose auto or cpu")
-    return device
+    return name
 
 
-def choose_dtype(amp: str, device: torch.device) -> torch.dtype | None:
+def _has_gpu_driver() -> bool:
+    """Return True if this machine has a driver that torch could use, of NVIDIA or AMD."""
+    if "torch" in sys.modules or Path("/dev/kfd").exists():
+        return True
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    return True
+
+
+def uses_16_bits(amp: str) -> bool:
+    """Return True if the layers of a network on the CPU work in bf16; see params.layers_format."""
+    return amp == "bf16" or (amp == "auto" and has_bf16())
+
+
+def choose_dtype(amp: str, device: str | torch.device) -> torch.dtype | None:
     """Return the dtype of a network's layers; None for float32.
 
     Args:
         amp: off, bf16, fp16 (CUDA only), or auto: 16 bits if the device has instructions for it.
     """
-    if device.type == "cpu":
-        return FORMATS["bf16"] if amp == "bf16" or (amp == "auto" and has_bf16()) else None
+    import torch
+    if torch.device(device).type == CPU:
+        return torch.bfloat16 if uses_16_bits(amp) else None
     if amp == "off":
         return None
     if amp == "auto":
         amp = "bf16" if torch.cuda.is_bf16_supported() else "fp16"
-    return FORMATS[amp]
+    return {"bf16": torch.bfloat16, "fp16": torch.float16}[amp]
+
+
+def is_out_of_memory(error: RuntimeError) -> bool:
+    """Return True for the error that torch raises when a GPU is out of memory."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(error, torch.cuda.OutOfMemoryError)

@@ -9,11 +9,9 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any, Protocol, Self, TypeVar
 
-import torch
-
 from lidar_perception.detectors.calibration import to_raw_score
 from lidar_perception.detectors.checkpoint import Header
-from lidar_perception.detectors.devices import CPU
+from lidar_perception.detectors.devices import CPU, is_out_of_memory
 from lidar_perception.types import InputError
 
 Result = TypeVar("Result")
@@ -22,7 +20,7 @@ Result = TypeVar("Result")
 class Movable(Protocol):
     """A network that can move to another device."""
 
-    def to(self, device: torch.device) -> Any: ...
+    def to(self, device: str) -> Any: ...
 
 
 @dataclass
@@ -33,14 +31,14 @@ class Placement:
         fallback: why the network runs on the CPU instead of the chosen device, or None.
     """
 
-    device: torch.device
+    device: str
     fallback: str | None = None
 
 
 class TrainedNetwork:
     """Base class of a network in inference mode, with the header of its weights and its device."""
 
-    def __init__(self, network: Movable, header: Header, device: torch.device):
+    def __init__(self, network: Movable, header: Header, device: str):
         self.network, self.header = network, header
         self.placement = Placement(device)
 
@@ -55,7 +53,7 @@ class TrainedNetwork:
         return self.config.classes
 
     @property
-    def device(self) -> torch.device:
+    def device(self) -> str:
         return self.placement.device
 
     def with_raw_scores(self) -> Self:
@@ -72,7 +70,7 @@ class TrainedNetwork:
         `classes`."""
         return [to_raw_score(name, scores[name], self.header.calibration) for name in self.classes]
 
-    def move(self, device: torch.device, cpu_fallback: bool = True) -> None:
+    def move(self, device: str, cpu_fallback: bool = True) -> None:
         """Run on another device from now on, or on the CPU if the device is out of memory.
 
         Raises:
@@ -81,7 +79,7 @@ class TrainedNetwork:
         self.placement.device = device
         try:
             self.network.to(device)
-        except torch.cuda.OutOfMemoryError as error:
+        except RuntimeError as error:
             self._fall_back(error, cpu_fallback)
 
     def run(self, work: Callable[[], Result], cpu_fallback: bool = True) -> Result:
@@ -92,11 +90,14 @@ class TrainedNetwork:
         """
         try:
             return work()
-        except torch.cuda.OutOfMemoryError as error:
+        except RuntimeError as error:
             self._fall_back(error, cpu_fallback)
             return work()
 
-    def _fall_back(self, error: Exception, cpu_fallback: bool) -> None:
+    def _fall_back(self, error: RuntimeError, cpu_fallback: bool) -> None:
+        """Move to the CPU if the device is out of memory; raise any other error again."""
+        if not is_out_of_memory(error):
+            raise error
         if self.device == CPU or not cpu_fallback:
             raise InputError(f"{self.device} is out of memory; use the CPU or a smaller network"
                              ) from error
@@ -105,8 +106,9 @@ class TrainedNetwork:
         self.move(CPU)
 
     def now(self) -> float:
-        """Return the time in seconds after all queued work of the device has finished."""
-        if self.device.type == "cuda":
+        """Return a time in seconds, after all work queued on the device is done."""
+        if self.device.startswith("cuda"):
+            import torch
             torch.cuda.synchronize(self.device)
         return perf_counter()
 

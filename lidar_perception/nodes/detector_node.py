@@ -14,6 +14,7 @@ from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.runs.compiling import lock_compilation, report_compilation
 from lidar_perception.runs.machine import count_cores
+from lidar_perception.runs.threads import set_thread_count
 from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.messages import read_cluster_ids, read_column
 from msg_utils.stamps import to_ns
@@ -36,7 +37,7 @@ class DetectorNode(ManagedNode):
             self.detector = self._load_detector()
         name = self.describe_network(self.detector.networks[0].config)
         self.counts.update(network=f"{name}, {' '.join(self.detector.classes)}",
-                           device=str(self.detector.device))
+                           device=self.detector.device)
         if self.detector.warning:  # not the state, which tells what the node waits for
             self.counts["doubt"] = self.detector.warning
             self.get_logger().warning(self.detector.warning)
@@ -68,11 +69,9 @@ class DetectorNode(ManagedNode):
         """Load the detector; on the CPU if CUDA is missing and cpu_fallback is set."""
         network_params, fallback = getattr(self.params, self.group), None
         weights = self.weights()
-        import torch  # takes seconds, so only after the weights are found
-
         from lidar_perception.detectors.devices import find_device
         # One thread is the default, by the environment that main.py sets.
-        torch.set_num_threads(network_params.threads or count_cores())
+        set_thread_count(network_params.threads or count_cores())
         device = network_params.device
         if device.startswith("cuda") and network_params.cpu_fallback:
             try:
@@ -111,7 +110,7 @@ class DetectorNode(ManagedNode):
         # The problem of the detector includes those of the intensity.
         problem = join_problems(result.problem, self.sensor.check_height(
             frame, params.ground.sensor_pose), tracking_problem)
-        self.counts.update(detections=len(result.detections), device=str(self.detector.device))
+        self.counts.update(detections=len(result.detections), device=self.detector.device)
         self.counts["best scores"] = " ".join(
             f"{name} {score:.2f}" for name, score in result.best.items())
         if problem:

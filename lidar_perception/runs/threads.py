@@ -3,11 +3,38 @@
 from __future__ import annotations
 
 import os
+import sys
+
+from lidar_perception.runs.machine import count_cores
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 # Of the OpenMP standard, and of GNU's OpenMP: spin this often first, because the next layer of a
 # network follows within microseconds.
 PASSIVE_WAITING = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "1000"}
+
+_thread_count = 0  # 0: not set
+
+
+def set_thread_count(count: int) -> None:
+    """Set the number of threads of networks, in compiled kernels and in torch."""
+    global _thread_count
+    _thread_count = count
+    set_torch_threads()
+
+
+def set_torch_threads() -> None:
+    """Apply set_thread_count() to torch if torch is loaded."""
+    if _thread_count and "torch" in sys.modules:
+        import torch
+        torch.set_num_threads(_thread_count)
+
+
+def thread_count() -> int:
+    """Return the number of threads of networks: as set, or as OMP_NUM_THREADS says, or one per
+    core."""
+    by_environment = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    return _thread_count or (int(by_environment) if by_environment.isdigit() else 0) or (
+        count_cores())
 
 
 def use_passive_waiting() -> None:
@@ -44,3 +71,4 @@ def limit_to_one_thread() -> None:
     from threadpoolctl import threadpool_limits  # imported here to keep commands fast
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     threadpool_limits(1)
+    set_thread_count(1)

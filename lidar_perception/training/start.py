@@ -11,6 +11,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
+
 from lidar_perception.detectors.checkpoint import read_network_name
 from lidar_perception.detectors.devices import find_device
 from lidar_perception.param_fields import with_values
@@ -82,7 +84,8 @@ def start_training(trainer: Trainer, request: TrainingRequest, params: Any,
     hours = request.budget if steps_given else request.budget or DEFAULT_BUDGET_H
     sensor = find_sensor(params.sensor, params.mount_height)
     settings = _collect_settings(request, params, sensor, init)
-    with join_process_group(find_device(request.device)) as device, directory.lock():
+    chosen = torch.device(find_device(request.device))
+    with join_process_group(chosen) as device, directory.lock():
         wait_for_all()  # until every process has looked at the files that rank 0 writes
         planner = Planner(trainer, request, params, sensor, device)
         if get_rank() == 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pointnet_samples
@@ -14,7 +15,6 @@ from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.normalized_view import rotate_boxes_half_turn, rotate_half_turn
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointpillars.config import HALF, RANGES
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
@@ -99,13 +99,14 @@ def test_nothing_behind_or_nothing_at_all_is_no_trouble(street):
 
 def test_what_cannot_see_that_says_so():
     config = pointnet_samples.small()
-    pointnet = PointNetDetector(PointNetClassifier(pointnet_samples.lively(config), Header(config)))
+    pointnet = PointNetDetector(pointnet_samples.make_classifier(
+        pointnet_samples.lively(config), Header(config)))
     assert pointnet.with_range("around") is pointnet
     with pytest.raises(InputError, match="pointnet always covers all directions"):
         pointnet.with_range("ahead")
     with pytest.raises(InputError, match="cannot see around: a grid of"):
         random_detector(low=(0.0, -3.52, -3.0), high=(7.04, 3.52, 1.0),
                         cell=0.22).with_range("around")
-    exported = make_detector(lambda pillars, maps: None, Header(tiny()))
+    exported = make_detector(SimpleNamespace(has_fixed_range=True), Header(tiny()))
     with pytest.raises(InputError, match="use the checkpoint to see around"):
         exported.with_range("around")

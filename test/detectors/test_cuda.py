@@ -39,7 +39,7 @@ def assert_alike(a: Detections, b: Detections, metres: float = 0.05, score: floa
 def test_a_detector_finds_on_cuda_what_it_finds_on_the_cpu(weights, scan):
     here, there = (open_detector(weights, device) for device in ("cpu", "cuda"))
     found = there(scan)
-    assert found.problem is None and there.device.type == "cuda"
+    assert found.problem is None and there.device == "cuda"
     assert_alike(here(scan).detections, found.detections)
 
 

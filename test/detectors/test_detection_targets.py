@@ -6,13 +6,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from detection_samples import BOXES, LABELS, tiny
+from detection_samples import BOXES, LABELS, anchor_tensors, tiny
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.detectors.nms import rotated_nms
-from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
-from lidar_perception.detectors.pointpillars.box_coder import decode, encode
+from lidar_perception.detectors.pointpillars.box_coder import decode
 from lidar_perception.detectors.pointpillars.config import ANCHORS
 from lidar_perception.detectors.pointpillars.losses import detection_loss
 from lidar_perception.detectors.pointpillars.network import Outputs
@@ -23,6 +22,7 @@ from lidar_perception.detectors.pointpillars.targets import (
     anchors_near,
     assign,
     dense,
+    encode,
     nearest_axis_iou,
     sparse,
 )
@@ -43,17 +43,17 @@ def some_boxes(seed, count=20, spread=6.0) -> np.ndarray:
 
 def test_anchors_lie_in_rows_along_y_then_x_then_class_then_yaw():
     config = tiny("v0")
-    anchors = make_anchors(config)
+    anchors, kinds = anchor_tensors(config)
     height, width = config.head_grid
     grid = anchors.view(height, width, 3, 2, 7)
-    assert torch.equal(anchor_classes(config).view(height, width, 3, 2)[2, 3].T,
+    assert torch.equal(kinds.view(height, width, 3, 2)[2, 3].T,
                        torch.arange(3).expand(2, 3))
     torch.testing.assert_close(grid[0, :, 0, 0, 0], (torch.arange(width) + 0.5) * 0.64)
     torch.testing.assert_close(grid[:, 0, 0, 0, 1], -5.12 + (torch.arange(height) + 0.5) * 0.64)
     for i, spec in enumerate(ANCHORS):
         assert grid[1, 1, i, :, 3:6].tolist() == [pytest.approx(spec.size)] * 2
         assert grid[1, 1, i, 0, 2] - spec.size[2] / 2 == pytest.approx(-1.73)  # on the ground
-    ends = make_anchors(tiny("v0", anchors_at="ends")).view(height, width, 3, 2, 7)
+    ends = anchor_tensors(tiny("v0", anchors_at="ends"))[0].view(height, width, 3, 2, 7)
     assert (ends[0, 0, 0, 0, :2].tolist(), ends[-1, -1, 0, 0, :2].tolist()) == (
         [0.0, pytest.approx(-5.12)], [pytest.approx(10.24), pytest.approx(5.12)])
 
@@ -66,7 +66,8 @@ def test_decoding_undoes_encoding(seed, offset):
     turned = codes.clone()
     turned[:, 6] += np.pi  # the direction is in the bins alone
     for given_codes in codes, turned:
-        back = decode(given_codes, bins, anchors, offset)
+        back = torch.from_numpy(decode(given_codes.numpy(), bins.numpy(), anchors.numpy(),
+                                       offset))
         torch.testing.assert_close(back[:, :6], boxes[:, :6], atol=1e-9, rtol=1e-9)
         away = torch.remainder(back[:, 6] - boxes[:, 6] + np.pi, 2 * np.pi) - np.pi
         assert away.abs().max() < 1e-9 and back[:, 6].abs().max() <= np.pi
@@ -84,7 +85,7 @@ def test_the_overlap_of_boxes_along_the_axes_is_the_usual_one():
 
 def test_targets_are_those_of_a_plain_reading():
     config = tiny("v0")
-    anchors, classes = make_anchors(config), anchor_classes(config)
+    anchors, classes = anchor_tensors(config)
     rng = np.random.default_rng(3)
     sizes = torch.tensor([a.size for a in config.anchors])
     labels = torch.from_numpy(rng.integers(0, 3, 8))
@@ -116,9 +117,8 @@ def test_targets_are_those_of_a_plain_reading():
 @given(seeds)
 def test_anchors_that_are_not_near_overlap_nothing(seed):
     config = tiny()
-    anchors = make_anchors(config)
+    anchors, kinds = anchor_tensors(config)
     boxes = torch.from_numpy(some_boxes(seed, 6, 12.0)).float()
-    kinds = anchor_classes(config)
     for index in range(len(config.anchors)):
         near = anchors_near(anchors, config, boxes, index)
         mine = torch.nonzero(kinds == index)[:, 0]
@@ -130,14 +130,15 @@ def test_anchors_that_are_not_near_overlap_nothing(seed):
 
 def test_every_object_has_an_anchor_and_the_order_of_objects_makes_no_difference():
     config = tiny("v0")
-    anchors = make_anchors(config)
+    anchors = anchor_tensors(config)[0]
     there = assign(anchors, config, BOXES, LABELS)
     back = assign(anchors, config, BOXES.flip(0), LABELS.flip(0))
     for a, b in zip(there, back):
         assert torch.equal(a, b)
     positive = there.labels[0] >= 0
-    decoded = decode(there.codes[0, positive], there.bins[0, positive], anchors[positive],
-                     config.direction_offset)
+    decoded = torch.from_numpy(decode(*(values.numpy() for values in (
+        there.codes[0, positive], there.bins[0, positive], anchors[positive])),
+        config.direction_offset))
     for box, label in zip(BOXES, LABELS):
         near = (decoded - box).abs().amax(1) < 1e-4
         assert near.any() and (there.labels[0, positive][near] == label).all()
@@ -148,7 +149,7 @@ def test_objects_without_size_and_no_objects_leave_background():
     broken = BOXES.clone()
     broken[0, 3], broken[1, 0] = 0, torch.nan
     for boxes, labels in (broken, LABELS), (BOXES[:0], LABELS[:0]):
-        assert (assign(make_anchors(config), config, boxes, labels).labels == BACKGROUND).all()
+        assert (assign(anchor_tensors(config)[0], config, boxes, labels).labels == BACKGROUND).all()
 
 
 # losses
@@ -166,8 +167,8 @@ def outputs_of(targets, classes=3, sure=12.0):
 
 def test_what_is_right_costs_nothing_and_what_is_wrong_costs():
     config = tiny("v0")
-    kinds = anchor_classes(config)
-    targets = assign(make_anchors(config), config, BOXES, LABELS)
+    kinds = anchor_tensors(config)[1]
+    targets = assign(anchor_tensors(config)[0], config, BOXES, LABELS)
     right = outputs_of(targets)
     assert detection_loss(right, targets, kinds).total < 1e-4
     turned = right._replace(codes=right.codes + torch.tensor([0, 0, 0, 0, 0, 0, np.pi]))
@@ -190,7 +191,7 @@ def batch(clouds: list[Targets]) -> Targets:
 
 def test_targets_without_the_background_hold_everything():
     config = tiny("v0")
-    anchors = make_anchors(config)
+    anchors = anchor_tensors(config)[0]
     clouds = [assign(anchors, config, BOXES[:n], LABELS[:n]) for n in (2, 0, 1)]
     assert {BACKGROUND, IGNORED, *range(2)} <= set(clouds[0].labels.flatten().tolist())
     for whole, *parts in zip(batch(clouds), *clouds):
@@ -199,7 +200,7 @@ def test_targets_without_the_background_hold_everything():
 
 def test_losses_of_a_batch_twice_are_the_same_and_do_not_see_what_is_ignored():
     config = tiny("v0")
-    anchors, kinds = make_anchors(config), anchor_classes(config)
+    anchors, kinds = anchor_tensors(config)
     targets, out = assign(anchors, config, BOXES, LABELS), random_outputs(anchors)
     once = detection_loss(out, targets, kinds)
     twice = detection_loss(Outputs(*(torch.cat([t, t]) for t in out)), batch([targets, targets]),
@@ -215,7 +216,7 @@ def test_losses_of_a_batch_twice_are_the_same_and_do_not_see_what_is_ignored():
 
 def test_scores_of_every_class_weigh_alike_however_many_anchors_it_is_on():
     config = tiny("v0")
-    anchors, kinds = make_anchors(config), anchor_classes(config)
+    anchors, kinds = anchor_tensors(config)
     targets, out = assign(anchors, config, BOXES, LABELS), random_outputs(anchors, 2)
     targets = batch([targets, assign(anchors, config, BOXES[:1], LABELS[:1])])
     parts = []

@@ -283,7 +283,7 @@ def test_no_part_leaves_its_device_where_it_may_not(detector, monkeypatch):
     monkeypatch.setattr(classifier, "predict", predict)
     other = copy.copy(detector)
     other.classifier = copy.copy(detector.classifier)
-    other.classifier.placement = Placement(torch.device("meta"))
+    other.classifier.placement = Placement("meta")
     other.params = with_values(detector.params, {"fused.cpu_fallback": False})
     with pytest.raises(InputError, match="meta is out of memory"):
         other(frame())

@@ -11,7 +11,7 @@ from pointnet_samples import blobs
 
 from lidar_perception.detectors.config_json import parse_config
 from lidar_perception.detectors.pointnet import config as config_module
-from lidar_perception.detectors.pointnet.box_head import BoxTargets, cluster_loss, decode, encode
+from lidar_perception.detectors.pointnet.box_head import BoxTargets, Outputs, decode, encode
 from lidar_perception.detectors.pointnet.calibration import calibrate, calibration_error
 from lidar_perception.detectors.pointnet.clusters import (
     NEAR,
@@ -21,8 +21,10 @@ from lidar_perception.detectors.pointnet.clusters import (
     network_input,
 )
 from lidar_perception.detectors.pointnet.config import ABLATIONS, NETWORKS, pointnet_config
-from lidar_perception.detectors.pointnet.network import Outputs, fused, make_pointnet, nearest
-from lidar_perception.detectors.pointnet.predict import found, outputs_of, predict
+from lidar_perception.detectors.pointnet.losses import cluster_loss
+from lidar_perception.detectors.pointnet.network import fused, make_pointnet, nearest
+from lidar_perception.detectors.pointnet.predict import found, predict, probabilities
+from lidar_perception.detectors.pointnet.torch_network import TorchPointNet, outputs_of
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
@@ -129,7 +131,7 @@ def test_wherever_a_cluster_lies_around_the_sensor_it_looks_the_same(rng):
     assert np.allclose(here.context, there.context, atol=1e-5)
     assert np.allclose(wrap_angle(there.azimuths - here.azimuths - turn), 0, atol=1e-6)
     # so its box is the same, turned
-    net = network()
+    net = TorchPointNet(network())
     first = predict(net, clusters).boxes
     second = predict(net, Clusters(turned, clusters.first, clusters.ids)).boxes
     assert np.allclose(second[:, 0], cos * first[:, 0] - sin * first[:, 1], atol=1e-3)
@@ -189,8 +191,9 @@ def test_points_that_fill_up_a_cluster_change_nothing(rng, name):
         assert torch.allclose(mine, theirs, atol=1e-5)
     for mine, theirs in zip(outputs_of(net, inputs, chunk=2), called(net, clusters)):  # left out
         assert torch.allclose(mine, theirs, atol=1e-5)
-    again = predict(net, clusters.take(np.array([2, 0])))
-    assert np.allclose(again.boxes, predict(net, clusters).boxes[[2, 0]], atol=1e-4)
+    engine = TorchPointNet(net)
+    again = predict(engine, clusters.take(np.array([2, 0])))
+    assert np.allclose(again.boxes, predict(engine, clusters).boxes[[2, 0]], atol=1e-4)
 
 
 def test_norms_go_into_the_layers_before_them(rng):
@@ -250,7 +253,8 @@ def test_decoding_undoes_encoding(rng):
                              rng.uniform(-np.pi, np.pi, count)])
     targets = encode(boxes, kinds, inputs.centres, inputs.azimuths, config)
     assert np.abs(targets.yaw_residuals).max() <= 1 + 1e-6
-    back = decode(outputs_with(targets, config.yaw_bins), inputs, config, kinds)
+    outputs = Outputs(*(x.numpy() for x in outputs_with(targets, config.yaw_bins)))
+    back = decode(outputs, inputs, config, kinds)
     assert np.allclose(back[:, :6], boxes[:, :6], atol=1e-4)
     assert np.allclose(wrap_angle(back[:, 6] - boxes[:, 6]), 0, atol=1e-5)
 
@@ -285,7 +289,8 @@ def test_calibration_makes_scores_as_often_right_as_they_say(rng):
     logits = truth * 4 + torch.tensor([2.0, 0, 0, 0])  # too sure, and partial to one class
     before = calibration_error(torch.softmax(logits, 1).numpy(), labels.numpy())
     calibrate(net, logits, labels)
-    after = calibration_error(net.probabilities(logits).numpy(), labels.numpy())
+    after = calibration_error(probabilities(*(x.numpy() for x in (
+        logits, net.temperature, net.offsets))), labels.numpy())
     assert after < 0.03 < 0.1 < before
     assert net.temperature.item() == pytest.approx(4, rel=0.1)
     unchanged = net.temperature.clone()
@@ -297,7 +302,7 @@ def test_calibration_makes_scores_as_often_right_as_they_say(rng):
 
 def test_of_boxes_on_the_same_object_the_best_is_kept(rng):
     config = pointnet_config()
-    predictions = predict(network(), blobs(rng, [20] * 4))
+    predictions = predict(TorchPointNet(network()), blobs(rng, [20] * 4))
     boxes = np.tile(np.array([5, 5, 0, 4, 2, 1.5, 0.3], np.float32), (4, 1))
     boxes[3, 0] += 20
     probabilities = np.array([[0.6, 0, 0, 0.4], [0.9, 0, 0, 0.1], [0.1, 0, 0, 0.9],

@@ -7,7 +7,7 @@ import pytest
 from pointnet_samples import eager, random_detector
 
 from lidar_perception.detectors.pointnet.clusters import ground_under
-from lidar_perception.detectors.pointnet.predict import CHUNK
+from lidar_perception.detectors.pointnet.torch_network import CHUNK
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import PointCloud
 
@@ -17,9 +17,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def test_small_and_large_clusters_and_many_are_no_trouble():
     rng = np.random.default_rng(0)
     detector = random_detector(with_values(eager(), {"pointnet.min_points": 1}))
-    detector.classifier.compiled, batches = None, []
-    network = detector.classifier.network
-    network.register_forward_hook(lambda net, given, _: batches.append(len(given[0])))
+    network, batches = detector.classifier.network, []
+    network.compiled = None
+    network.network.register_forward_hook(lambda net, given, _: batches.append(len(given[0])))
     one = PointCloud(np.float32([[9, 0, -1]]), np.ones(1, np.float32))
     assert len(detector(one, cluster_ids=np.ones(1, int)).detections) == 1
     xyz = rng.uniform([5, -3, -1.7], [9, 3, 2], (50_000, 3)).astype(np.float32)

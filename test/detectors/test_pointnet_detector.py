@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from detection_samples import frame, same
 from detection_samples import lively as lively_pointpillars
 from detection_samples import tiny as tiny_pointpillars
-from pointnet_samples import CPU, eager, lively, random_detector, small
+from pointnet_samples import CPU, eager, lively, make_classifier, random_detector, small
 from samples import object_folder
 
 from lidar_perception.cli.main import cli
@@ -30,7 +30,6 @@ from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.normalized_view import to_sensor_frame
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet import weights_file as weights_module
-from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.detector import PointNetDetector, load_pointnet_detector
 from lidar_perception.detectors.pointnet.network import load_pointnet
 from lidar_perception.detectors.pointnet.params import CLUSTERING, GROUND, STEPS
@@ -214,9 +213,9 @@ def test_what_is_not_a_number_is_left_out_and_said(layer, ids):
     found = detector(replace(scan, intensity=intensity), cluster_ids=ids)
     assert same(found, expected)
     assert f"1 of {ids.max()} clusters" in found.problem and "NaN" in found.problem
-    network = detector.classifier.network
+    network = detector.classifier.network.network
     getattr(network, layer).bias.fill_(np.nan)
-    broken = PointNetDetector(PointNetClassifier(network, detector.classifier.header),
+    broken = PointNetDetector(make_classifier(network, detector.classifier.header),
                               detector.params)
     found = broken(scan, cluster_ids=ids)
     assert len(found.detections) == 0 and "NaN" in found.problem
@@ -257,11 +256,11 @@ def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(ids, monkey
             raise torch.cuda.OutOfMemoryError("CUDA out of memory")
         return real(network, clusters, **labels)
     monkeypatch.setattr(module, "predict", predict)
-    broken.classifier.placement.device = torch.device("meta")
+    broken.classifier.placement.device = "meta"
     for _ in range(2):
         found = broken(scan, cluster_ids=ids)
         assert same(found, expected) and "CPU" in found.problem and broken.device == CPU
-    broken.classifier.placement.device = torch.device("meta")
+    broken.classifier.placement.device = "meta"
     broken.params = with_values(eager(), {"pointnet.cpu_fallback": False})
     with pytest.raises(InputError, match="out of memory"):
         broken(scan, cluster_ids=ids)
@@ -337,7 +336,7 @@ def test_weights_of_another_network_or_other_classes_are_refused(saved, tmp_path
 
 def test_fewer_classes_are_found_as_what_they_are(ids):
     config = small(classes=("Pedestrian",), sizes=small().sizes[1:2])
-    found = PointNetDetector(PointNetClassifier(lively(config), Header(config)), eager())(
+    found = PointNetDetector(make_classifier(lively(config), Header(config)), eager())(
         frame(), cluster_ids=ids).detections
     assert len(found) > 3 and {*found.class_ids} == {CLASSES.index("Pedestrian")}
 
@@ -390,5 +389,5 @@ def test_real_scans_of_any_network_go_through(data):
     scan = open_recording(data / "kitti_object").frames[0].load()
     for name in "improved", "pointnet", "pointnet2":
         config = small(name)
-        found = PointNetDetector(PointNetClassifier(lively(config), Header(config)))(scan)
+        found = PointNetDetector(make_classifier(lively(config), Header(config)))(scan)
         assert found.problem is None and found.timings["network"] > 0

@@ -13,6 +13,7 @@ from detection_samples import lively, make_detector, random_detector, same, tiny
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.layer_weights import arrays_of
 from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.parallel import run_in_parts
@@ -20,11 +21,11 @@ from lidar_perception.detectors.params import NmsParams
 from lidar_perception.detectors.pointpillars import sparse
 from lidar_perception.detectors.pointpillars.config import network_config
 from lidar_perception.detectors.pointpillars.expert import NetworkInput
-from lidar_perception.detectors.pointpillars.network import fused
-from lidar_perception.detectors.pointpillars.pillars import make_pillars
+from lidar_perception.detectors.pointpillars.pillars import Pillars, make_pillars
 from lidar_perception.detectors.pointpillars.sparse_layers import dilated, shrunk
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.param_fields import with_values
+from lidar_perception.runs.threads import set_thread_count
 from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import InputError
@@ -37,12 +38,16 @@ WIDE = dict(low=(-12.8, -14.08, -3.0), high=(12.8, 14.08, 1.0))  # 176 x 160 pil
 
 
 def strong(config, seed=0):
-    """A fused network in which a point still matters after the last layer."""
+    """A network in which a point still matters after the last layer."""
     network = lively(config, seed)
     for module in network.modules():
         if isinstance(module, torch.nn.Conv2d) and module.kernel_size == (3, 3):
             module.weight.mul_(2.0)
-    return fused(network)
+    return network
+
+
+def sparse_network(network):
+    return sparse.SparseNetwork(network.pillar_net.config, arrays_of(network))
 
 
 def inputs(config, points, drawn, seed=0, share=1.0):
@@ -53,16 +58,17 @@ def inputs(config, points, drawn, seed=0, share=1.0):
     cloud[:, :2] = config.low[:2] + share * (cloud[:, :2] - config.low[:2])
     if config.cluster_ids:
         cloud = np.column_stack([cloud, rng.integers(0, 60, points)])
-    maps = torch.from_numpy((rng.random((1, 3, *config.grid)) < drawn).astype(np.uint8))
+    maps = (rng.random((1, 3, *config.grid)) < drawn).astype(np.uint8)
     for axis in 2, 3:
         maps.swapaxes(2, axis)[:, :, int(share * maps.shape[axis]):] = 0
-    return (make_pillars([torch.from_numpy(cloud.astype(np.float32))], config),
+    return (make_pillars(cloud.astype(np.float32), config),
             maps if config.pseudo_map else None)
 
 
 def by_torch(network, pillars, maps):
     """Features and logits (H * W, C) of all cells."""
-    features = network.features(pillars, maps)
+    pillars = Pillars(*map(torch.from_numpy, pillars[:3]), *pillars[3:])
+    features = network.features(pillars, None if maps is None else torch.from_numpy(maps))
     return [x[0].flatten(1).T.numpy() for x in (features, network.head.scores(features))]
 
 
@@ -71,7 +77,7 @@ def assert_equal(config, points, drawn, reach=None, seed=0, share=1.0):
     pillars, maps = inputs(config, points, drawn, seed, share)
     with torch.inference_mode():
         expected = by_torch(network, pillars, maps)
-        cells, features, logits = sparse.SparseNetwork(network).evaluate(pillars, maps, reach)
+    cells, features, logits = sparse_network(network).evaluate(pillars, maps, reach)
     assert len(cells) == len(expected[0]) or reach is not None
     values = features.at(cells)[:, :expected[0].shape[1]]
     for found, wanted in (values, expected[0]), (logits, expected[1]):
@@ -108,7 +114,7 @@ def test_head_is_evaluated_near_points_only():
     config = network_config("v4", "compact", **WIDE)
     assert_equal(config, 10, 0.0, reach=sparse.REACH)
     pillars, maps = inputs(config, 10, 0.0)
-    network = sparse.SparseNetwork(strong(config))
+    network = sparse_network(strong(config))
     prediction = network(pillars, maps)
     occupied = np.zeros(config.grid, bool)
     occupied.ravel()[pillars.cells] = True
@@ -117,7 +123,7 @@ def test_head_is_evaluated_near_points_only():
     away = np.maximum(np.abs(np.arange(height)[:, None, None] - rows),
                       np.abs(np.arange(width)[:, None] - columns)).min(axis=2)
     cells = np.flatnonzero(away <= 6)
-    per_cell = network.head.per_cell
+    per_cell = config.anchors_per_cell
     np.testing.assert_array_equal(
         prediction.anchors, (cells[:, None] * per_cell + np.arange(per_cell)).ravel())
     assert prediction.logits.shape == (len(cells) * per_cell, 3)
@@ -126,30 +132,27 @@ def test_head_is_evaluated_near_points_only():
 def test_boxes_equal_torch_at_any_anchors():
     config = tiny("v4")
     network, (pillars, maps) = strong(config), inputs(config, 30, 0.02)
-    with torch.inference_mode():
-        expected = TorchNetwork(lively(config))  # fused once more: the same weights
-        expected.network = network
-        wanted = expected(pillars, maps)
-        found = sparse.SparseNetwork(network)(pillars, maps)
-        chosen = torch.tensor([0, 5, 17, len(found.anchors) - 1])
-        for ours, theirs in zip(found.boxes_at(chosen), wanted.boxes_at(found.anchors[chosen])):
-            torch.testing.assert_close(ours, theirs, rtol=0, atol=TOLERANCE)
+    wanted, found = TorchNetwork(network)(pillars, maps), sparse_network(network)(pillars, maps)
+    chosen = np.array([0, 5, 17, len(found.anchors) - 1])
+    for ours, theirs in zip(found.boxes_at(chosen), wanted.boxes_at(found.anchors[chosen])):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=TOLERANCE)
 
 
 def test_threads_and_earlier_clouds_change_nothing(monkeypatch):
     monkeypatch.setattr(sparse, "MIN_PER_PART", 1000)
     config = network_config("v4", "compact", **WIDE)
-    network = sparse.SparseNetwork(strong(config))
+    network = sparse_network(strong(config))
     first, second = inputs(config, 50, 0.001), inputs(config, 3000, 0.05, seed=1)
     alone = network(*first)
-    torch.set_num_threads(3)
+    set_thread_count(3)
     kept = network(*second)
     again = network(*first)
-    assert torch.equal(alone.logits, again.logits) and torch.equal(alone.anchors, again.anchors)
-    chosen = torch.arange(9)
-    assert all(map(torch.equal, alone.boxes_at(chosen), again.boxes_at(chosen)))
-    torch.set_num_threads(1)
-    assert torch.equal(kept.logits, network(*second).logits)
+    assert np.array_equal(alone.logits, again.logits)
+    assert np.array_equal(alone.anchors, again.anchors)
+    chosen = np.arange(9)
+    assert all(map(np.array_equal, alone.boxes_at(chosen), again.boxes_at(chosen)))
+    set_thread_count(1)
+    assert np.array_equal(kept.logits, network(*second).logits)
 
 
 def test_an_error_in_one_part_is_raised(monkeypatch):
@@ -157,7 +160,7 @@ def test_an_error_in_one_part_is_raised(monkeypatch):
         if begin:
             raise ZeroDivisionError
 
-    torch.set_num_threads(2)
+    set_thread_count(2)
     with pytest.raises(ZeroDivisionError):
         run_in_parts(fail, 100, 4)
 
@@ -181,7 +184,7 @@ def test_networks_that_torch_must_run(monkeypatch):
                           (tiny("v1", neck="deconv"), "neck"),
                           (tiny("v1", max_points=4, zero_row=True), "rows of zeros")]:
         network = lively(config)
-        assert words in sparse.unsupported(fused(network))
+        assert words in sparse.unsupported(network.pillar_net.config)
         assert TorchNetwork(network, engine="auto").sparse is None
         with pytest.raises(InputError, match=f"{words}.*; choose the engine auto or torch"):
             TorchNetwork(network, engine="sparse")
@@ -190,7 +193,7 @@ def test_networks_that_torch_must_run(monkeypatch):
     with pytest.raises(InputError, match="16 bits"):
         TorchNetwork(network, amp="bf16", engine="sparse")
     monkeypatch.setattr(sparse, "LANES", 0)
-    assert "AVX2" in sparse.unsupported(fused(network))
+    assert "AVX2" in sparse.unsupported(network.pillar_net.config)
     assert TorchNetwork(network, engine="auto").sparse is None
 
 
@@ -199,7 +202,7 @@ def test_engine_is_a_parameter(weights):
     quick = {f"{weights}.warm_up": False}
     for engine, expected in ("auto", True), ("sparse", True), ("torch", False):
         detector = open_detector(weights, "cpu", settings={**quick, f"{weights}.engine": engine})
-        assert (detector.proposer.network.sparse is not None) == expected
+        assert isinstance(detector.proposer.network, sparse.SparseNetwork) == expected
     with pytest.raises(InputError, match="engine"):
         open_detector("pointpillars", "cpu", settings={
             "pointpillars.warm_up": False, "pointpillars.engine": "sparse",

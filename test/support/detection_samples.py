@@ -7,12 +7,14 @@ import torch
 
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import DetectionResult
+from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.config import NetworkConfig, network_config
 from lidar_perception.detectors.pointpillars.detector import CPU, PointPillarsDetector
 from lidar_perception.detectors.pointpillars.network import make_network
 from lidar_perception.detectors.pointpillars.params import DetectorParams
+from lidar_perception.detectors.pointpillars.prediction import Network
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
-from lidar_perception.detectors.pointpillars.torch_network import Network, TorchNetwork
+from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import Detections, PointCloud
 
@@ -27,6 +29,11 @@ def tiny(version: str = "v0", **changes) -> NetworkConfig:
                  map_channels=(4, 8), block_channels=(8, 12, 16), block_layers=(1, 1, 1),
                  deconv_channels=8, fpn_channels=8)
     return network_config(version, "compact", **{**small, **changes})
+
+
+def anchor_tensors(config: NetworkConfig) -> tuple[torch.Tensor, torch.Tensor]:
+    """The anchors (A, 7) of a network, and the class (A,) of each."""
+    return torch.from_numpy(make_anchors(config)), torch.from_numpy(anchor_classes(config))
 
 
 def two_objects(seed: int = 0) -> np.ndarray:
@@ -85,7 +92,7 @@ def random_detector(version: str = "v0", params: DetectorParams | None = None,
 
 
 def make_detector(network: Network, header: Header, params: DetectorParams = DetectorParams(),
-                  device: torch.device = CPU) -> PointPillarsDetector:
+                  device: str = CPU) -> PointPillarsDetector:
     return PointPillarsDetector(PointPillarsProposer(network, header, device), params)
 
 

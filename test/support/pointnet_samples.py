@@ -10,11 +10,12 @@ from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.config import PointNetConfig, pointnet_config
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
-from lidar_perception.detectors.pointnet.network import CONTEXT, PointNet, make_pointnet
+from lidar_perception.detectors.pointnet.network import CONTEXT, PointNet, fused, make_pointnet
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
+from lidar_perception.detectors.pointnet.torch_network import TorchPointNet
 from lidar_perception.param_fields import with_values
 
-CPU = torch.device("cpu")
+CPU = "cpu"
 SMALL = dict(points=32, centroids=12, coarse=4, neighbours=(4, 6, 8), coarse_neighbours=4,
              point_channels=(8, 8), group_channels=(8, 8), local_channels=12, global_channels=16,
              head_channels=(16,))
@@ -53,11 +54,16 @@ def eager(params: PointNetDetectorParams = PointNetDetectorParams(),
         "car", "pedestrian", "cyclist", "other")} | {"pointnet.nms.iou": 0.9})
 
 
+def make_classifier(network: PointNet, header: Header, engine: str = "auto") -> PointNetClassifier:
+    """For inference."""
+    return PointNetClassifier(TorchPointNet(fused(network), engine), header)
+
+
 def random_detector(params: PointNetDetectorParams | None = None,
                     **changes) -> PointNetDetector:
     """With random weights."""
     config = small(**changes)
-    return PointNetDetector(PointNetClassifier(lively(config), Header(config)), params or eager())
+    return PointNetDetector(make_classifier(lively(config), Header(config)), params or eager())
 
 
 def blobs(rng, sizes, spread=0.4):

@@ -8,13 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from pointnet_samples import SMALL, blobs
+from pointnet_samples import SMALL, blobs, make_classifier
 from samples import CALIBRATION
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import DetectionResult
-from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.config import pointnet_config
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
@@ -236,9 +235,10 @@ def test_clusters_equal_those_of_detector_at_scene_height(rng):
     things = fill_boxes(rng, small_boxes, 6).points
     points = np.concatenate([seen.points, things])
     scene = raise_scene(replace(seen, points=points, height=3.5), SENSOR_HEIGHT - 3.5)
-    classifier = PointNetClassifier(make_pointnet(CONFIG), Header(CONFIG), engine="torch")
+    classifier = make_classifier(make_pointnet(CONFIG), Header(CONFIG), "torch")
     read = []
-    classifier.network.register_forward_pre_hook(lambda _, inputs: read.append(len(inputs[0])))
+    classifier.network.network.register_forward_pre_hook(
+        lambda _, inputs: read.append(len(inputs[0])))
     detector = PointNetDetector(classifier, with_values(
         PointNetDetectorParams(ground=CONFIG.ground, clustering=CONFIG.clustering),
         {"ground.sensor_pose.height": scene.height, "pointnet.min_points": 5}))

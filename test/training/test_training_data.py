@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from detection_samples import BOXES, tiny, two_objects
+from detection_samples import BOXES, anchor_tensors, tiny, two_objects
 from samples import WALKER
 from training_toy import STILL, broken_folder, prepare_all
 
 from lidar_perception.detectors.contract import DetectionResult
-from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.config import RANGES, network_config
 from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED, dense
 from lidar_perception.geometry import is_within, wrap_angle
@@ -168,7 +167,7 @@ def test_share_of_scenes_gets_pasted_objects(tmp_path):
 
 def test_anchors_on_uncounted_objects_are_ignored():
     config = tiny()
-    anchors, kinds = make_anchors(config), anchor_classes(config)
+    anchors, kinds = anchor_tensors(config)
     rng = np.random.default_rng(0)
     whole = ScenePreparation(config, STILL)(scene_of_two(), rng)
     found = labels_of(whole, anchors)
@@ -193,7 +192,7 @@ def test_scene_without_points_in_range_is_refused():
     far = ScenePreparation(tiny(), STILL)(
         scene_of_two(boxes=BOXES.numpy() + [90, 0, 0, 0, 0, 0, 0]), np.random.default_rng(0))
     assert len(far.boxes) == 0 and len(far.labels) == 0
-    assert (labels_of(far, make_anchors(tiny())) == BACKGROUND).all()
+    assert (labels_of(far, anchor_tensors(tiny())[0]) == BACKGROUND).all()
 
 
 def test_validation_scores_perfect_and_blind_detectors(tmp_path):

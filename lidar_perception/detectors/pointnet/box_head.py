@@ -10,20 +10,23 @@ from __future__ import annotations
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
-from torch.nn import functional
 
 from lidar_perception.detectors.pointnet.clusters import ClusterInput
 from lidar_perception.detectors.pointnet.config import PointNetConfig
-from lidar_perception.detectors.pointnet.network import Outputs
 from lidar_perception.geometry import wrap_angle
 
-BOX_WEIGHT, YAW_BIN_WEIGHT = 1.0, 0.3  # lambda of Eq. 18, of boxes and of yaw bins
-SMOOTH = 0.2       # m, and like numbers: from here on the box loss is linear
+Array = TypeVar("Array")  # of NumPy or torch
 
 
-Array = TypeVar("Array", np.ndarray, Tensor)
+class Outputs(NamedTuple, Generic[Array]):
+    """The output of a network for B clusters: logits (B, K + 1), background last; centres (B, 3),
+    sizes (B, 3), yaw_bins (B, Y) and yaw_residuals (B, Y) as above, Y bins."""
+
+    logits: Array
+    centres: Array
+    sizes: Array
+    yaw_bins: Array
+    yaw_residuals: Array
 
 
 class BoxTargets(NamedTuple, Generic[Array]):
@@ -52,12 +55,12 @@ def encode(boxes: np.ndarray, labels: np.ndarray, centres: np.ndarray, azimuths:
                       rest.astype(np.float32))
 
 
-def decode(outputs: Outputs, inputs: ClusterInput, config: PointNetConfig,
+def decode(outputs: Outputs[np.ndarray], inputs: ClusterInput, config: PointNetConfig,
            labels: np.ndarray) -> np.ndarray:
     """(K, 7) float32 boxes, if cluster i is of class labels[i]: the inverse of encode."""
-    centres, logs, residuals = (x.float().cpu().numpy().astype(np.float64) for x in
+    centres, logs, residuals = (x.astype(np.float64) for x in
                                 (outputs.centres, outputs.sizes, outputs.yaw_residuals))
-    bins = outputs.yaw_bins.argmax(dim=1).cpu().numpy()
+    bins = outputs.yaw_bins.argmax(axis=1)
     cos, sin = np.cos(inputs.azimuths), np.sin(inputs.azimuths)
     boxes = np.empty((len(bins), 7))
     boxes[:, 0] = inputs.centres[:, 0] + cos * centres[:, 0] - sin * centres[:, 1]
@@ -68,34 +71,3 @@ def decode(outputs: Outputs, inputs: ClusterInput, config: PointNetConfig,
     rest = np.clip(residuals[np.arange(len(bins)), bins], -1, 1)
     boxes[:, 6] = wrap_angle(inputs.azimuths + (bins + rest / 2) * width)
     return boxes.astype(np.float32)
-
-
-class Losses(NamedTuple):
-    """Scalars; total is the weighted sum of the others."""
-
-    total: Tensor
-    classes: Tensor
-    boxes: Tensor
-    yaw_bins: Tensor
-
-
-def cluster_loss(outputs: Outputs, labels: Tensor, targets: BoxTargets[Tensor], has_box: Tensor,
-                 weights: Tensor | None = None) -> Losses:
-    """Cross entropy of labels (B,), K for background and -1 for those of which nothing is said,
-    with a weight (K + 1,) for each class; smooth L1 of the boxes of those that have one (B,) bool,
-    and cross entropy of their yaw bins. targets: of B rows."""
-    classes = functional.cross_entropy(outputs.logits.float(), labels, weight=weights,
-                                       ignore_index=-1)
-    if not has_box.any():
-        zero = sum((x.sum() for x in outputs), classes.new_zeros(())) * 0.0
-        return Losses(classes + zero, classes, zero, zero)
-    bins = targets.yaw_bins[has_box]
-    residuals = outputs.yaw_residuals[has_box].gather(1, bins[:, None])[:, 0]
-    found = torch.cat([outputs.centres[has_box], outputs.sizes[has_box], residuals[:, None]], 1)
-    wanted = torch.cat([targets.centres[has_box], targets.sizes[has_box],
-                        targets.yaw_residuals[has_box][:, None]], 1)
-    boxes = functional.smooth_l1_loss(found.float(), wanted, beta=SMOOTH,
-                                      reduction="none").sum(dim=1).mean()
-    yaw_bins = functional.cross_entropy(outputs.yaw_bins[has_box].float(), bins)
-    total = classes + BOX_WEIGHT * boxes + YAW_BIN_WEIGHT * yaw_bins
-    return Losses(total, classes, boxes, yaw_bins)

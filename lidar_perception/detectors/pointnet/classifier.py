@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.devices import CPU
-from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.pointnet.clusters import Clusters, points_of
-from lidar_perception.detectors.pointnet.compiled import CompiledPointNet
-from lidar_perception.detectors.pointnet.network import PointNet, fused
-from lidar_perception.detectors.pointnet.predict import Predictions, predict
+from lidar_perception.detectors.pointnet.predict import Network, Predictions, predict
 from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.types import CLASSES, Detections, PointCloud
 
@@ -20,29 +16,17 @@ MIN_POINTS = 3      # in a box that is classified
 
 
 class PointNetClassifier(TrainedNetwork):
-    """A PointNet for inference.
+    """A PointNet for inference."""
 
-    Args:
-        network: as loaded or trained. Its batch norms are folded into its layers, in place.
-        engine: what runs it on the CPU: torch; or auto, compiled kernels if the CPU has AVX2.
-    """
+    network: Network
 
-    network: PointNet
-
-    def __init__(self, network: PointNet, header: Header, device: torch.device = CPU,
-                 engine: str = "auto"):
-        network = fused(network)
-        self.compiled = CompiledPointNet(network) if LANES and engine == "auto" else None
-        super().__init__(network.to(device), header, device)
+    def __init__(self, network: Network, header: Header, device: str = CPU):
+        super().__init__(network, header, device)
 
     def predict(self, clusters: Clusters, labels: np.ndarray | None = None,
                 cpu_fallback: bool = True) -> Predictions:
         """Return the predictions for K clusters, see predict.predict."""
-        def work() -> Predictions:
-            compiled = self.compiled if self.device == CPU else None
-            return predict(compiled or self.network, clusters, labels=labels)
-
-        return self.run(work, cpu_fallback)
+        return self.run(lambda: predict(self.network, clusters, labels=labels), cpu_fallback)
 
     def classify(self, proposals: Detections, obstacles: PointCloud, ground: np.ndarray,
                  selected: np.ndarray, cpu_fallback: bool = True) -> tuple[np.ndarray, np.ndarray]:

@@ -16,6 +16,7 @@ from lidar_perception.geometry import counting_sort, points_in_boxes
 from lidar_perception.groups import group_by_id
 from lidar_perception.types import SENSOR_HEIGHT, PointCloud
 
+POINT, CONTEXT = 5, 6  # numbers that the network reads of a point, and of a whole cluster
 NEAR = (3.0, 6.0, 12.0)  # m: so far around a cluster the ground is looked for
 FEWEST = 3               # points of it
 CELLS = 64               # of NEAR[0] m along x and y, then they begin anew: far places share them

@@ -7,13 +7,13 @@ computed. The result is that of torch within rounding.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor, nn
 
+from lidar_perception.detectors.layer_weights import LayerWeights, Weights
 from lidar_perception.detectors.matrix_kernel import (
     BLOCK,
     LANES,
@@ -24,16 +24,11 @@ from lidar_perception.detectors.matrix_kernel import (
 )
 from lidar_perception.detectors.parallel import run_in_parts
 from lidar_perception.detectors.pointnet import kernels
-from lidar_perception.detectors.pointnet.clusters import ClusterInput
-from lidar_perception.detectors.pointnet.network import (
-    POINT,
-    CoarseNet,
-    LinearNormRelu,
-    LocalNet,
-    Outputs,
-    PointNet,
-)
+from lidar_perception.detectors.pointnet.box_head import Outputs
+from lidar_perception.detectors.pointnet.clusters import CONTEXT, POINT, ClusterInput
+from lidar_perception.detectors.pointnet.config import PointNetConfig
 
+NORM_EPS = 1e-5  # of batch norms
 CHUNK = 32  # clusters whose rows stay in the cache
 
 ZERO, NO_FLOOR = np.float32(0), np.float32(-np.inf)
@@ -54,26 +49,49 @@ class Layer(NamedTuple):
 
 
 class CompiledPointNet:
-    """A fused network on the CPU, in eval mode. Several threads may call it at once. Only where
-    LANES is not 0."""
+    """A network on the CPU. Several threads may call it at once. Only where LANES is not 0.
 
-    def __init__(self, network: PointNet):
+    Args:
+        tensors: name -> array, the state_dict of network.make_pointnet(config).
+
+    Raises:
+        Misfit: the tensors are those of another network.
+    """
+
+    def __init__(self, config: PointNetConfig, tensors: Mapping[str, np.ndarray]):
         assert LANES
-        self.network, self.config = network, network.config
-        self.points = _layers(network.points)
-        self.raw = None if network.raw is None else _layers(network.raw)
-        self.fine = None if network.fine is None else _layers(network.fine)
-        self.local = None if network.local is None else _Local(
-            network.local, self.points[-1].channels)
-        self.coarse = None if network.coarse is None else _Coarse(network.coarse)
-        self.head = _layers(network.head)
-        outputs = [network.classes, network.box]
-        self.outputs = _layer(torch.cat([layer.weight for layer in outputs]),
-                              torch.cat([layer.bias for layer in outputs]), relu=False)
+        self.config = config
+        weights = LayerWeights(tensors, NORM_EPS)
+        shallow, local, wide = (config.point_channels[-1], config.local_channels,
+                                config.global_channels)
+        self.points = _layers(weights, "points", POINT, *config.point_channels)
+        self.raw = self.fine = self.local = self.coarse = None
+        found = (shallow + (local if config.groups else 0)) if config.skip else 0
+        if config.groups:
+            self.local = _Local(config, weights)
+            self.fine = _layers(weights, "fine", local, wide)
+            found += wide
+        if config.mrg:
+            self.coarse = _Coarse(config, weights)
+            found += wide
+        if config.mrg or not config.groups:
+            self.raw = _layers(weights, "raw", shallow, wide)
+            found += wide
+        self.head = _layers(weights, "head", found + CONTEXT, *config.head_channels)
+        self.widths = [len(config.classes) + 1, 3, 3, config.yaw_bins, config.yaw_bins]
+        outputs = [weights.take(name, (width, config.head_channels[-1])) for name, width in (
+            ("classes", self.widths[0]), ("box", sum(self.widths[1:])))]
+        weight, bias = map(np.concatenate, zip(*outputs))
+        self.outputs = _layer(weight, bias, relu=False)
+        self.temperature = weights.array("temperature", (1,))
+        self.offsets = weights.array("offsets", (self.widths[0],))
+        weights.finish()
 
-    def __call__(self, inputs: ClusterInput) -> Outputs:
+    def to(self, device: str) -> None:
+        """Stay on the CPU."""
+
+    def __call__(self, inputs: ClusterInput) -> Outputs[np.ndarray]:
         """Compute what the network returns for K clusters; K may be 0."""
-        classes, bins = len(self.config.classes) + 1, self.config.yaw_bins
         values = np.empty((len(inputs.context), self.outputs.channels), np.float32)
 
         def compute(begin: int, end: int) -> None:
@@ -83,7 +101,7 @@ class CompiledPointNet:
                                             inputs.context[rows])
 
         run_in_parts(compute, len(values), -(-len(values) // CHUNK))
-        return Outputs(*torch.from_numpy(values).split([classes, 3, 3, bins, bins], dim=1))
+        return Outputs(*np.split(values, [*accumulate(self.widths[:-1])], axis=1))
 
     def _values(self, points: np.ndarray, valid: np.ndarray, context: np.ndarray) -> np.ndarray:
         """Return (K, C) for a few clusters, the arguments as in ClusterInput."""
@@ -115,12 +133,14 @@ class CompiledPointNet:
 class _Local:
     """LocalNet; its groups hold only the points that are there."""
 
-    def __init__(self, net: LocalNet, shallow: int):
-        self.shallow = shallow  # width of the features of a point
-        self.radii = np.array([radius for radius, _ in net.groups], np.float32)
-        self.counts = np.array([count for _, count in net.groups])
-        self.nets = [_layers(scale) for scale in net.nets]
-        self.join = _layers(net.join)
+    def __init__(self, config: PointNetConfig, weights: LayerWeights):
+        self.shallow = config.point_channels[-1]  # width of the features of a point
+        radii, counts = zip(*config.groups)
+        self.radii, self.counts = np.array(radii, np.float32), np.array(counts)
+        self.nets = [_layers(weights, f"local.nets.{i}", POINT, *config.group_channels)
+                     for i in range(len(radii))]
+        self.join = _layers(weights, "local.join", len(radii) * config.group_channels[-1]
+                            + self.shallow, config.local_channels)
 
     def __call__(self, rows: np.ndarray, first: np.ndarray, features: np.ndarray,
                  most: int) -> tuple[np.ndarray, np.ndarray]:
@@ -142,13 +162,13 @@ class _Local:
 class _Coarse:
     """CoarseNet; the maximum over all groups of a cluster."""
 
-    def __init__(self, net: CoarseNet):
-        self.radius, self.count = np.float32(net.radius), net.neighbours
-        linear = _linear(net.net[0])
-        of_position, of_features = linear.weight.detach().split([3, linear.in_features - 3], dim=1)
-        self.features = _layer(of_features, linear.bias, relu=False)
+    def __init__(self, config: PointNetConfig, weights: LayerWeights):
+        self.radius, self.count = np.float32(config.coarse_radius), config.coarse_neighbours
+        weight, bias = _normed(weights, "coarse.net.0", 3 + config.local_channels,
+                               config.global_channels)
+        self.features = _layer(weight[:, 3:], bias, relu=False)
         self.position = np.zeros((3, len(self.features.bias)), np.float32)
-        self.position[:, :linear.out_features] = of_position.T.numpy()
+        self.position[:, :len(weight)] = weight[:, :3].T
 
     def __call__(self, rows: np.ndarray, first: np.ndarray, local: np.ndarray,
                  first_centre: np.ndarray, most: int) -> np.ndarray:
@@ -158,22 +178,20 @@ class _Coarse:
         return greatest[:, :self.features.channels]
 
 
-def _layers(net: nn.Module) -> list[Layer]:
-    return [_layer(linear.weight, linear.bias, relu=True)
-            for linear in map(_linear, net.children())]
+def _layers(weights: LayerWeights, name: str, *channels: int) -> list[Layer]:
+    """Take the layers of network.mlp(*channels)."""
+    return [_layer(*_normed(weights, f"{name}.{i}", read, out), relu=True)
+            for i, (read, out) in enumerate(pairwise(channels))]
 
 
-def _linear(layer: nn.Module) -> nn.Linear:
-    assert isinstance(layer, LinearNormRelu)
-    linear = layer[0]
-    assert isinstance(linear, nn.Linear)
-    return linear
+def _normed(weights: LayerWeights, name: str, channels: int, out: int) -> Weights:
+    """Take a network.LinearNormRelu."""
+    return weights.take(f"{name}.0", (out, channels), f"{name}.1")
 
 
-def _layer(weight: Tensor, bias: Tensor | None, relu: bool) -> Layer:
-    weights = packed(weight.detach()[:, :, None].numpy())
-    own = None if bias is None else bias.detach().numpy()
-    return Layer(weights, padded_bias(own, len(weights) * BLOCK), len(weight), relu)
+def _layer(weight: np.ndarray, bias: np.ndarray | None, relu: bool) -> Layer:
+    values = packed(weight[:, :, None])
+    return Layer(values, padded_bias(bias, len(values) * BLOCK), len(weight), relu)
 
 
 def _through(layers: Sequence[Layer], rows: np.ndarray) -> np.ndarray:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import copy
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-import torch
 
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.base import NetworkDetector, make_synthetic_frame
 from lidar_perception.detectors.boxes import move_cars_to_points
 from lidar_perception.detectors.calibration import calibrate_scores
+from lidar_perception.detectors.checkpoint import Header, read_arrays
 from lidar_perception.detectors.contract import DetectionResult
-from lidar_perception.detectors.devices import find_device
+from lidar_perception.detectors.devices import CPU, find_device
+from lidar_perception.detectors.layer_weights import Misfit
+from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.detectors.normalized_view import (
     NormalizedView,
@@ -24,10 +27,12 @@ from lidar_perception.detectors.normalized_view import (
 )
 from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
-from lidar_perception.detectors.pointnet.network import load_pointnet
+from lidar_perception.detectors.pointnet.compiled import CompiledPointNet
+from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams, PointNetParams
-from lidar_perception.detectors.pointnet.predict import Predictions, found
+from lidar_perception.detectors.pointnet.predict import Network, Predictions, found
 from lidar_perception.detectors.pointnet.weights_file import weights_file
+from lidar_perception.runs.threads import set_thread_count
 from lidar_perception.types import PointCloud
 
 
@@ -146,15 +151,27 @@ def load_pointnet_detector(path: str | Path = "", device: str = "auto",
     settings = PointNetParams() if params is None else params.pointnet
     path = Path(path) if str(path) not in ("", ".") else weights_file(settings)
     if settings.threads:
-        torch.set_num_threads(settings.threads)
+        set_thread_count(settings.threads)
     target = find_device(device)
-    header, network = load_pointnet(path)
+    header, network = _load_network(path, target, settings.engine)
     if params is None:
         params = PointNetDetectorParams(ground=header.config.ground,
                                         clustering=header.config.clustering)
-    classifier = PointNetClassifier(network, header, engine=settings.engine)
+    classifier = PointNetClassifier(network, header)
     classifier.move(target, settings.cpu_fallback)
     detector = PointNetDetector(classifier, params)
     if settings.warm_up:
         detector.warm_up()
     return detector
+
+
+def _load_network(path: Path, device: str, engine: str) -> tuple[Header, Network]:
+    """Load the network of a checkpoint; with torch only where no compiled kernels can run it."""
+    if device == CPU and engine == "auto" and LANES:
+        with suppress(Misfit):  # torch finds out what does not fit
+            header, tensors = read_arrays(path, PointNetConfig)
+            return header, CompiledPointNet(header.config, tensors)
+    from lidar_perception.detectors.pointnet.network import fused, load_pointnet
+    from lidar_perception.detectors.pointnet.torch_network import TorchPointNet
+    header, network = load_pointnet(path)
+    return header, TorchPointNet(fused(network), engine)

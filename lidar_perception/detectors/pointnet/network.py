@@ -17,7 +17,6 @@ import copy
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -25,20 +24,9 @@ from torch.nn import functional
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from lidar_perception.detectors.checkpoint import Header, load_checkpoint
+from lidar_perception.detectors.pointnet.box_head import Outputs
+from lidar_perception.detectors.pointnet.clusters import CONTEXT, POINT
 from lidar_perception.detectors.pointnet.config import PointNetConfig
-
-POINT, CONTEXT = 5, 6   # numbers that describe a point, and a whole cluster; see clusters.py
-
-
-class Outputs(NamedTuple):
-    """logits (B, K + 1), background last; centres (B, 3), sizes (B, 3), yaw_bins (B, Y) and
-    yaw_residuals (B, Y) as in box_head.py."""
-
-    logits: Tensor
-    centres: Tensor
-    sizes: Tensor
-    yaw_bins: Tensor
-    yaw_residuals: Tensor
 
 
 class LinearNormRelu(nn.Sequential):
@@ -166,11 +154,11 @@ class PointNet(nn.Module):
         self.head = mlp(found + CONTEXT, *config.head_channels)
         self.classes = nn.Linear(config.head_channels[-1], classes + 1)
         self.box = nn.Linear(config.head_channels[-1], 6 + 2 * bins)
-        # What calibration found: probabilities are softmax(logits / temperature + offsets).
+        # What calibration found, see predict.probabilities.
         self.register_buffer("temperature", torch.ones(1))
         self.register_buffer("offsets", torch.zeros(classes + 1))
 
-    def forward(self, points: Tensor, valid: Tensor, context: Tensor) -> Outputs:
+    def forward(self, points: Tensor, valid: Tensor, context: Tensor) -> Outputs[Tensor]:
         config = self.config
         features = self.points(points)                                     # (B, N, C)
         found, shallow = [], [features.amax(dim=1)]
@@ -194,10 +182,6 @@ class PointNet(nn.Module):
         bins = config.yaw_bins
         return Outputs(self.classes(x), box[:, :3], box[:, 3:6], box[:, 6:6 + bins],
                        box[:, 6 + bins:])
-
-    def probabilities(self, logits: Tensor) -> Tensor:
-        """(B, K + 1), calibrated."""
-        return torch.softmax(logits.float() / self.temperature + self.offsets, dim=1)
 
 
 def make_pointnet(config: PointNetConfig) -> PointNet:

@@ -4,20 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
-import torch
 
 from lidar_perception.detectors.nms import apply_nms
 from lidar_perception.detectors.params import NmsParams
-from lidar_perception.detectors.pointnet.box_head import decode
+from lidar_perception.detectors.pointnet.box_head import Outputs, decode
 from lidar_perception.detectors.pointnet.clusters import ClusterInput, Clusters, network_input
-from lidar_perception.detectors.pointnet.compiled import CompiledPointNet
 from lidar_perception.detectors.pointnet.config import PointNetConfig
-from lidar_perception.detectors.pointnet.network import Outputs, PointNet
 from lidar_perception.types import Detections
 
-CHUNK = 256  # clusters at a time: bounds the memory, and the caches like it
+
+class Network(Protocol):
+    """A PointNet that predict() can run.
+
+    temperature (1,), offsets (K + 1,): float32, see probabilities().
+    """
+
+    config: PointNetConfig
+    temperature: np.ndarray
+    offsets: np.ndarray
+
+    def to(self, device: str) -> None:
+        """Move to another device if the network can."""
+
+    def __call__(self, inputs: ClusterInput) -> Outputs[np.ndarray]:
+        """Return the outputs for K clusters; K may be 0."""
 
 
 @dataclass(frozen=True)
@@ -50,41 +63,26 @@ def found(predictions: Predictions, config: PointNetConfig, least: Sequence[floa
                         predictions.labels[chosen], config.classes, nms)
 
 
-@torch.inference_mode()
-def predict(network: PointNet | CompiledPointNet, clusters: Clusters, seed: int = 0,
-            chunk: int = CHUNK, labels: np.ndarray | None = None) -> Predictions:
-    """What the network, in eval mode, makes of each of K clusters, K may be 0; labels (K,): the
-    classes that are asked about, instead of the likeliest."""
+def predict(network: Network, clusters: Clusters, seed: int = 0,
+            labels: np.ndarray | None = None) -> Predictions:
+    """Return the predictions for K clusters, K may be 0; labels (K,): the classes that are asked
+    about, instead of the likeliest."""
     config, classes = network.config, len(network.config.classes)
     if len(clusters) == 0:
         return Predictions(np.zeros((0, classes + 1), np.float32), np.zeros(0, np.int64),
                            np.zeros((0, 7), np.float32))
     inputs = network_input(clusters, config.points, seed)
-    if isinstance(network, CompiledPointNet):
-        outputs, network = network(inputs), network.network
-    else:
-        outputs = outputs_of(network, inputs, chunk)
-    probabilities = network.probabilities(outputs.logits).cpu().numpy()
+    outputs = network(inputs)
+    calibrated = probabilities(outputs.logits, network.temperature, network.offsets)
     if labels is None:
-        labels = probabilities[:, :classes].argmax(axis=1)
-    return Predictions(probabilities, labels, decode(outputs, inputs, config, labels))
+        labels = calibrated[:, :classes].argmax(axis=1)
+    return Predictions(calibrated, labels, decode(outputs, inputs, config, labels))
 
 
-@torch.inference_mode()
-def outputs_of(network: PointNet, inputs: ClusterInput, chunk: int = CHUNK) -> Outputs:
-    """The network's outputs for one cluster or more. Most clusters have few points: those that have
-    about the same number are taken together, without the places that none of them fills."""
-    device, least = network.temperature.device, network.config.least_points
-    sizes = np.maximum(inputs.valid.sum(axis=1), least)
-    doubled = np.ceil(np.log2(sizes / least))
-    order = np.argsort(doubled, kind="stable")
-    alike = np.split(order, np.flatnonzero(np.diff(doubled[order])) + 1)
-    parts = []
-    for rows in alike:
-        width = sizes[rows].max()
-        for begin in range(0, len(rows), chunk):
-            part = rows[begin:begin + chunk]
-            parts.append(network(*(torch.from_numpy(x).to(device) for x in (
-                inputs.points[part, :width], inputs.valid[part, :width], inputs.context[part]))))
-    back = torch.from_numpy(np.argsort(order)).to(device)
-    return Outputs(*(torch.cat(column)[back] for column in zip(*parts)))
+def probabilities(logits: np.ndarray, temperature: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """Return calibrated probabilities (B, K + 1) of logits (B, K + 1): softmax(logits / temperature
+    + offsets), float32."""
+    with np.errstate(all="ignore"):  # of broken weights, which are reported
+        scaled = logits / temperature + offsets
+        exponentials = np.exp(scaled - scaled.max(axis=1, keepdims=True))
+        return exponentials / exponentials.sum(axis=1, keepdims=True)

@@ -1,45 +1,27 @@
-"""Boxes to what the network predicts relative to an anchor, and back (SECOND, Yan et al. 2018).
+"""Boxes from what the network predicts relative to an anchor (SECOND, Yan et al. 2018).
 
 The angle is coded without its direction, which half of the circle it lies in: that is a bin of its
-own.
+own. targets.py has the inverse.
 """
 
 from __future__ import annotations
 
 import math
 
-import torch
-from torch import Tensor
+import numpy as np
 
 
-def encode(boxes: Tensor, anchors: Tensor, offset: float) -> tuple[Tensor, Tensor]:
-    """codes (N, 7) float32 and bins (N,) int64, 0 or 1, of boxes (N, 7) [x y z l w h yaw] relative
-    to anchors (N, 7). l w h must be above 0."""
-    diagonal = torch.hypot(anchors[:, 3], anchors[:, 4])
-    codes = torch.stack([
-        (boxes[:, 0] - anchors[:, 0]) / diagonal,
-        (boxes[:, 1] - anchors[:, 1]) / diagonal,
-        (boxes[:, 2] - anchors[:, 2]) / anchors[:, 5],
-        *torch.log(boxes[:, 3:6] / anchors[:, 3:6]).unbind(1),
-        boxes[:, 6] - anchors[:, 6]], dim=1)
-    return codes, direction(boxes[:, 6], offset)
-
-
-def decode(codes: Tensor, bins: Tensor, anchors: Tensor, offset: float) -> Tensor:
-    """(N, 7) boxes, yaw in [-pi, pi): the inverse of encode; of the angle in codes only the line
-    counts, bins say its direction. Sizes are at most e^4 times the anchor's."""
-    diagonal = torch.hypot(anchors[:, 3], anchors[:, 4])
-    line = codes[:, 6] + anchors[:, 6] - offset
-    yaw = line - torch.floor(line / math.pi) * math.pi + offset + math.pi * bins.to(line.dtype)
-    return torch.stack([
-        codes[:, 0] * diagonal + anchors[:, 0],
-        codes[:, 1] * diagonal + anchors[:, 1],
-        codes[:, 2] * anchors[:, 5] + anchors[:, 2],
-        *(torch.exp(codes[:, 3:6].clamp(max=4.0)) * anchors[:, 3:6]).unbind(1),
-        torch.remainder(yaw + math.pi, 2 * math.pi) - math.pi], dim=1)
-
-
-def direction(yaw: Tensor, offset: float) -> Tensor:
-    """0 for yaw in [offset, offset + pi), 1 for the other half of the circle; int64."""
-    turned = torch.remainder(yaw - offset, 2 * math.pi)
-    return (turned >= math.pi).long()
+def decode(codes: np.ndarray, bins: np.ndarray, anchors: np.ndarray, offset: float) -> np.ndarray:
+    """Return (N, 7) float32 boxes [x y z l w h yaw], yaw in [-pi, pi), of codes (N, 7) float32 and
+    bins (N,) relative to anchors (N, 7). Of the angle in codes only the line counts, bins say its
+    direction. Sizes are at most e^4 times the anchor's."""
+    with np.errstate(over="ignore", invalid="ignore"):  # of broken weights, which are reported
+        diagonal = np.hypot(anchors[:, 3], anchors[:, 4])
+        line = codes[:, 6] + anchors[:, 6] - offset
+        yaw = line - np.floor(line / math.pi) * math.pi + offset + math.pi * bins.astype(line.dtype)
+        return np.column_stack([
+            codes[:, 0] * diagonal + anchors[:, 0],
+            codes[:, 1] * diagonal + anchors[:, 1],
+            codes[:, 2] * anchors[:, 5] + anchors[:, 2],
+            np.exp(np.minimum(codes[:, 3:6], 4.0)) * anchors[:, 3:6],
+            np.remainder(yaw + math.pi, 2 * math.pi) - math.pi])

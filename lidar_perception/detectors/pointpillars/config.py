@@ -46,6 +46,8 @@ HALF = Range(low=(-5.12, -51.2, -3.0), high=(51.2, 51.2, 1.0))
 
 XY_SCALE = 0.02  # of networks that are trained here
 CHOICES = {"neck": ("deconv", "fpn"), "fusion": ("add", "concat"), "anchors_at": ("cells", "ends")}
+NORM_EPS = 1e-3  # of batch norms
+CODE, BINS = 7, 2  # numbers that describe a box, and halves of the circle of headings
 MAX_CELLS = 1 << 22  # of a grid: 100 m x 100 m of 5 cm; what is computed grows with it
 MAX_LAYERS = 64
 
@@ -172,6 +174,10 @@ class NetworkConfig:
         """(H, W) of the feature map that the head reads."""
         stride = self.block_strides[0]
         return self.grid[0] // stride, self.grid[1] // stride
+
+    @property
+    def anchors_per_cell(self) -> int:
+        return len(self.anchors) * len(self.yaws)
 
     @property
     def point_columns(self) -> int:

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import copy
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-import torch
 
 from lidar_perception.detectors.base import NetworkDetector, make_synthetic_frame
+from lidar_perception.detectors.checkpoint import Header, read_arrays
 from lidar_perception.detectors.contract import DetectionResult
-from lidar_perception.detectors.devices import CPU, find_device
+from lidar_perception.detectors.devices import CPU, find_device, uses_16_bits
+from lidar_perception.detectors.layer_weights import Misfit
 from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.detectors.normalized_view import NormalizedView, restore_detections
+from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.expert import experts
-from lidar_perception.detectors.pointpillars.network import load_network
 from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams, PointPillarsParams
+from lidar_perception.detectors.pointpillars.prediction import Network
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
-from lidar_perception.detectors.pointpillars.torch_network import Network, TorchNetwork
+from lidar_perception.detectors.pointpillars.sparse import SparseNetwork, unsupported
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
+from lidar_perception.runs.threads import set_thread_count
 from lidar_perception.types import InputError, PointCloud
 
 
@@ -101,7 +105,7 @@ def load_detector(path: str | Path = "", device: str = "auto",
     """
     path = Path(path) if str(path) not in ("", ".") else weights_file(params.pointpillars)
     if params.pointpillars.threads:
-        torch.set_num_threads(params.pointpillars.threads)
+        set_thread_count(params.pointpillars.threads)
     network: Network
     if path.suffix == ".onnx":
         from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork
@@ -118,11 +122,10 @@ def load_detector(path: str | Path = "", device: str = "auto",
                              "checkpoint it was exported from")
     else:
         target = find_device(device)
-        header, loaded = load_network(path)
         if target != CPU and params.pointpillars.engine == "sparse":
             raise InputError(f"the sparse engine runs on the CPU, not on {target}; set device: "
                              "cpu, or engine: auto")
-        network = TorchNetwork(loaded, CPU, params.pointpillars.amp, params.pointpillars.engine)
+        header, network = _load_network(path, target, params.pointpillars)
     for name in "version", "size":
         wanted, actual = getattr(params.pointpillars, name), getattr(header.config, name)
         if wanted not in ("auto", actual):
@@ -134,3 +137,16 @@ def load_detector(path: str | Path = "", device: str = "auto",
     if params.pointpillars.warm_up:
         detector.warm_up()
     return detector
+
+
+def _load_network(path: Path, device: str, params: PointPillarsParams) -> tuple[Header, Network]:
+    """Load the network of a checkpoint; with torch only where the sparse engine cannot run it."""
+    if device == CPU and params.engine != "torch" and not uses_16_bits(params.amp):
+        with suppress(Misfit):  # torch finds out what does not fit
+            header, tensors = read_arrays(path, NetworkConfig)
+            if unsupported(header.config) is None:
+                return header, SparseNetwork(header.config, tensors)
+    from lidar_perception.detectors.pointpillars.network import load_network
+    from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
+    header, network = load_network(path)
+    return header, TorchNetwork(network, CPU, params.amp, params.engine)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -21,27 +21,13 @@ from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
 from lidar_perception.detectors.checkpoint import Header, Net, load_checkpoint
-from lidar_perception.detectors.pointpillars.config import NetworkConfig
+from lidar_perception.detectors.pointpillars.config import BINS, CODE, NORM_EPS, NetworkConfig
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 
-EPS, MOMENTUM = 1e-3, 0.01  # of batch norms
-CODE, BINS = 7, 2      # numbers that describe a box, and halves of the circle of headings
+MOMENTUM = 0.01        # of batch norms
 PRIOR = 0.01           # score of every anchor before training
 
 Conv = nn.Conv2d | nn.ConvTranspose2d
-
-
-class Prediction(NamedTuple):
-    """The output of a network for one cloud.
-
-    logits: (M, K) of the anchors that were evaluated.
-    boxes_at: Returns codes (N, 7) and directions (N, 2) at rows (N,) of logits.
-    anchors: (M,) int64, the anchors of these rows; None where they are all anchors in order.
-    """
-
-    logits: Tensor
-    boxes_at: Callable[[Tensor], tuple[Tensor, Tensor]]
-    anchors: Tensor | None = None
 
 
 class Outputs(NamedTuple):
@@ -56,7 +42,7 @@ class ConvNormRelu(nn.Sequential):
     """A convolution, batch norm, ReLU."""
 
     def __init__(self, conv: Conv):
-        super().__init__(conv, nn.BatchNorm2d(conv.out_channels, EPS, MOMENTUM),
+        super().__init__(conv, nn.BatchNorm2d(conv.out_channels, NORM_EPS, MOMENTUM),
                          nn.ReLU(inplace=True))
 
 
@@ -73,11 +59,11 @@ class PillarNet(nn.Module):
         self.config = config
         self.linear = nn.Linear(config.point_columns + config.offset_columns,
                                 config.pillar_channels, bias=False)
-        self.norm: nn.Module = nn.BatchNorm1d(config.pillar_channels, EPS, MOMENTUM)
+        self.norm: nn.Module = nn.BatchNorm1d(config.pillar_channels, NORM_EPS, MOMENTUM)
 
     @torch.autocast("cuda", enabled=False)
     @torch.autocast("cpu", enabled=False)  # where x is 60 m, 16 bits would leave 25 cm of it
-    def forward(self, pillars: Pillars) -> Tensor:
+    def forward(self, pillars: Pillars[Tensor]) -> Tensor:
         # The clusters' numbers come last, so that versions with and without share a beginning.
         points = pillars.points
         inputs = torch.cat([points[:, :2] * self.config.xy_scale, points[:, 2:4], pillars.offsets,
@@ -209,7 +195,7 @@ class PointPillars(nn.Module):
         self.pillar_net, self.map_net = pillar_net, map_net
         self.blocks, self.neck, self.head = nn.ModuleList(blocks), neck, head
 
-    def features(self, pillars: Pillars, maps: Tensor | None = None) -> Tensor:
+    def features(self, pillars: Pillars[Tensor], maps: Tensor | None = None) -> Tensor:
         """(B, neck.channels, H/2, W/2); maps (B, 3, H, W) uint8 for V4."""
         x = self.pillar_net(pillars)                            # (B, C, H, W)
         if self.map_net is not None:
@@ -220,7 +206,7 @@ class PointPillars(nn.Module):
             levels.append(x)
         return self.neck(levels)
 
-    def forward(self, pillars: Pillars, maps: Tensor | None = None) -> Outputs:
+    def forward(self, pillars: Pillars[Tensor], maps: Tensor | None = None) -> Outputs:
         return self.head(self.features(pillars, maps))
 
 
@@ -238,7 +224,7 @@ def make_network(config: NetworkConfig) -> PointPillars:
             if config.neck == "deconv" else
             FpnNeck(config.block_channels, config.block_strides, config.fpn_channels,
                     config.fusion))
-    head = Head(neck.channels, len(config.anchors) * len(config.yaws), len(config.anchors))
+    head = Head(neck.channels, config.anchors_per_cell, len(config.anchors))
     return channels_last(PointPillars(PillarNet(config), map_net, blocks, neck, head))
 
 

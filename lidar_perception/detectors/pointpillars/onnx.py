@@ -13,20 +13,17 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from lidar_perception.detectors.checkpoint import KEY, Header
-from lidar_perception.detectors.pointpillars.config import NetworkConfig
-from lidar_perception.detectors.pointpillars.network import (
-    BINS,
-    CODE,
-    PointPillars,
-    Prediction,
-    fused,
-)
+from lidar_perception.detectors.pointpillars.config import BINS, CODE, NetworkConfig
+from lidar_perception.detectors.pointpillars.network import PointPillars, fused
 from lidar_perception.detectors.pointpillars.pillars import Pillars
+from lidar_perception.detectors.pointpillars.prediction import Prediction
 from lidar_perception.runs.files import write_bytes
+from lidar_perception.runs.threads import thread_count
 from lidar_perception.types import InputError
 
 OPSET = 18
@@ -90,10 +87,12 @@ def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None
 class OnnxNetwork:
     """An exported network in ONNX Runtime, on the CPU."""
 
+    has_fixed_range = True
+
     def __init__(self, session: Any, source: str, config: NetworkConfig):
         self.session, self.source = session, source
         self.inputs = [i.name for i in session.get_inputs()]
-        anchors = math.prod(config.head_grid) * len(config.anchors) * len(config.yaws)
+        anchors = math.prod(config.head_grid) * config.anchors_per_cell
         self.shapes = [(1, anchors, width) for width in (len(config.anchors), CODE, BINS)]
 
     @staticmethod
@@ -107,7 +106,7 @@ class OnnxNetwork:
         if not Path(path).is_file():
             raise InputError(f"there is no exported network {path}")
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = torch.get_num_threads()
+        options.intra_op_num_threads = thread_count()
         try:
             session = onnxruntime.InferenceSession(str(path), options,
                                                    providers=["CPUExecutionProvider"])
@@ -124,16 +123,16 @@ class OnnxNetwork:
                              "export it again")
         return header, OnnxNetwork(session, str(path), header.config)
 
-    def to(self, device: torch.device) -> None:
-        """Stays on the CPU."""
+    def to(self, device: str) -> None:
+        """Stay on the CPU."""
 
-    def __call__(self, pillars: Pillars, maps: Tensor | None) -> Prediction:
+    def __call__(self, pillars: Pillars[np.ndarray], maps: np.ndarray | None) -> Prediction:
         given = dict(points=pillars.points, offsets=pillars.offsets, cells=pillars.cells,
                      cluster_map=maps)
         try:
-            logits, codes, directions = map(torch.from_numpy, self.session.run(
-                OUTPUTS, {name: value.numpy() for name, value in given.items()
-                          if name in self.inputs and value is not None}))
+            logits, codes, directions = self.session.run(
+                OUTPUTS, {name: value for name, value in given.items()
+                          if name in self.inputs and value is not None})
         except Exception as error:  # its errors have no common base
             raise InputError(f"ONNX Runtime cannot run {self.source}: "
                              f"{str(error).splitlines()[0]}") from None

@@ -8,7 +8,7 @@ from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
-import torch
+from scipy.special import expit
 
 from lidar_perception.detectors.calibration import calibrate_scores
 from lidar_perception.detectors.checkpoint import Header
@@ -26,9 +26,8 @@ from lidar_perception.detectors.pointpillars.anchors import make_anchors
 from lidar_perception.detectors.pointpillars.box_coder import decode
 from lidar_perception.detectors.pointpillars.config import HALF, RANGES, NetworkConfig
 from lidar_perception.detectors.pointpillars.expert import NetworkInput, network_input
-from lidar_perception.detectors.pointpillars.network import Prediction
 from lidar_perception.detectors.pointpillars.pillars import make_pillars
-from lidar_perception.detectors.pointpillars.torch_network import Network, TorchNetwork
+from lidar_perception.detectors.pointpillars.prediction import Network, Prediction
 from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.types import SENSOR_HEIGHT, Detections, InputError
 
@@ -58,18 +57,18 @@ class PointPillarsProposer(TrainedNetwork):
 
     network: Network
 
-    def __init__(self, network: Network, header: Header, device: torch.device = CPU,
+    def __init__(self, network: Network, header: Header, device: str = CPU,
                  pass_config: NetworkConfig | None = None):
         super().__init__(network, header, device)
         self.pass_config = pass_config or self.config
         self.half_turns = (False,) if pass_config is None else (False, True)
-        self.anchors = make_anchors(self.pass_config, device)
+        self.anchors = make_anchors(self.pass_config)
 
     def with_range(self, range: str) -> PointPillarsProposer:
         """Return this network for another range, see NetworkDetector.with_range."""
         if range == "auto" or (range == "around") == (self.config.low[0] < 0):
             return self
-        if not isinstance(self.network, TorchNetwork):
+        if self.network.has_fixed_range:
             raise InputError("an exported network has one fixed range; use the checkpoint to see "
                              f"{range}")
         try:
@@ -109,8 +108,7 @@ class PointPillarsProposer(TrainedNetwork):
                                  nms)
             return [begin, *times, self.now()], found
 
-        with torch.inference_mode():
-            times, found = self.run(work, cpu_fallback)
+        times, found = self.run(work, cpu_fallback)
         steps = dict(zip(TIMED_STEPS, (np.diff(times) * 1e3).tolist()))
         return replace(found, timings=steps,
                        problem=found.problem or problem or self.placement.fallback)
@@ -140,11 +138,8 @@ class PointPillarsProposer(TrainedNetwork):
         """Return when the network began and ended, and its outputs."""
         arguments = []
         for given in inputs.values():
-            points = torch.from_numpy(given.points).to(self.device)
-            maps = None
-            if given.cluster_map is not None:
-                maps = torch.from_numpy(given.cluster_map)[None].to(self.device)
-            arguments.append((make_pillars([points], self.pass_config), maps))
+            maps = None if given.cluster_map is None else given.cluster_map[None]
+            arguments.append((make_pillars(given.points, self.pass_config), maps))
         begin = self.now()
         predictions = [self.network(*each) for each in arguments]
         return [begin, self.now()], dict(zip(inputs, predictions))
@@ -159,15 +154,14 @@ class PointPillarsProposer(TrainedNetwork):
         problem: str | None = None
         logits = [prediction.logits for prediction in predictions.values()
                   if len(prediction.logits)]
-        if any(len(rows) > 1 and torch.equal(rows[0], rows[-1]) and (rows == rows[0]).all()
+        if any(len(rows) > 1 and np.array_equal(rows[0], rows[-1]) and (rows == rows[0]).all()
                for rows in logits):
             boxes, best_logits, labels = boxes[:0], best_logits[:0], labels[:0]
             problem = ("the network gives every place the same scores; the weights are broken, "
                        "use others")
         elif len(boxes) == 0 and logits:
-            best, problem = self.best_scores(torch.sigmoid(torch.cat(logits).amax(dim=0)).tolist())
-        scores = torch.sigmoid(torch.from_numpy(best_logits)).numpy()
-        detections = apply_nms(boxes, scores, labels, self.classes, nms)
+            best, problem = self.best_scores(expit(np.concatenate(logits).max(axis=0)).tolist())
+        detections = apply_nms(boxes, expit(best_logits), labels, self.classes, nms)
         return DetectionResult(calibrate_scores(detections, self.header.calibration),
                                problem=problem, best=best)
 
@@ -175,23 +169,21 @@ class PointPillarsProposer(TrainedNetwork):
                       max_boxes: int) -> Boxes:
         """Return the boxes of one pass that reach their thresholds, rotated back."""
         logits = prediction.logits
-        limits = logits.new_tensor([*map(_logit, min_scores)])
+        limits = np.array([*map(_logit, min_scores)], np.float32)
         # Class by class: a reduction over three columns takes three times as long.
-        passes = reduce(torch.logical_or, map(torch.ge, logits.unbind(dim=1), limits))
-        chosen = torch.nonzero(passes)[:, 0]
-        best, labels = logits[chosen].max(dim=1)
-        valid = torch.nonzero(best >= limits[labels])[:, 0]
+        chosen = np.flatnonzero(reduce(np.logical_or, map(np.greater_equal, logits.T, limits)))
+        labels = logits[chosen].argmax(axis=1)
+        best = logits[chosen, labels]
+        valid = np.flatnonzero(best >= limits[labels])
         if len(valid) > max_boxes:
-            valid = valid[best[valid].topk(max_boxes).indices]
+            valid = valid[np.argpartition(-best[valid], max_boxes)[:max_boxes]]
         chosen, best, labels = chosen[valid], best[valid], labels[valid]
         codes, directions = prediction.boxes_at(chosen)
-        if self.anchors.device != codes.device:  # the network may have been moved by a copy
-            self.anchors = make_anchors(self.pass_config, codes.device)
         if prediction.anchors is not None:
             chosen = prediction.anchors[chosen]
-        boxes = decode(codes.float(), directions.argmax(dim=1), self.anchors[chosen],
-                       self.config.direction_offset).cpu().numpy()
-        found = Boxes(boxes, best.cpu().numpy(), labels.cpu().numpy())
+        boxes = decode(codes, directions.argmax(axis=1), self.anchors[chosen],
+                       self.config.direction_offset)
+        found = Boxes(boxes, best, labels)
         if len(self.half_turns) > 1:
             own = boxes[:, 0] >= -SHARED_M
             found = Boxes(*(column[own] for column in found))

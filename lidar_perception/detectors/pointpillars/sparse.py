@@ -10,18 +10,18 @@ within rounding.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
+from lidar_perception.detectors.layer_weights import LayerWeights, Weights
 from lidar_perception.detectors.matrix_kernel import BLOCK, LANES, packed, padded, padded_bias
 from lidar_perception.detectors.parallel import run_in_parts
 from lidar_perception.detectors.pointpillars import sparse_kernels as kernels
-from lidar_perception.detectors.pointpillars.network import FpnNeck, PointPillars, Prediction
+from lidar_perception.detectors.pointpillars.config import BINS, CODE, NORM_EPS, NetworkConfig
 from lidar_perception.detectors.pointpillars.pillars import Pillars
+from lidar_perception.detectors.pointpillars.prediction import Prediction
 from lidar_perception.detectors.pointpillars.sparse_layers import (
     Grid,
     Layer,
@@ -47,14 +47,13 @@ class Map(NamedTuple):
         return self.rows[self.numbers[1 + cells // width, 1 + cells % width]]
 
 
-def unsupported(network: PointPillars) -> str | None:
+def unsupported(config: NetworkConfig) -> str | None:
     """Return why SparseNetwork cannot run a network on this machine, None where it can."""
-    config = network.pillar_net.config
     if not LANES:
         return "this processor has no AVX2"
     if not config.remove_ground:
         return f"{config.version} also reads the ground, which occupies most cells"
-    if not isinstance(network.neck, FpnNeck) or config.fusion != "add":
+    if config.neck != "fpn" or config.fusion != "add":
         return "its neck does not add its maps"
     if config.zero_row:
         return "its pillars have rows of zeros"
@@ -62,46 +61,65 @@ def unsupported(network: PointPillars) -> str | None:
 
 
 class SparseNetwork:
-    """A fused network on the CPU, for which unsupported() returns None. Several threads may call
-    it at once."""
+    """A network on the CPU, for which unsupported() returns None. Several threads may call it at
+    once.
 
-    def __init__(self, network: PointPillars):
-        self.head, self.has_map = network.head, network.map_net is not None
-        self.first_block = 1 if network.map_net is None else 2 + len(network.map_net)
-        self.layers = make_layers(network)
-        linear, config = network.pillar_net.linear, network.pillar_net.config
+    Args:
+        tensors: name -> array, the state_dict of network.make_network(config).
+
+    Raises:
+        Misfit: the tensors are those of another network.
+    """
+
+    has_fixed_range = False
+
+    def __init__(self, config: NetworkConfig, tensors: Mapping[str, np.ndarray]):
+        self.config = config
+        weights = LayerWeights(tensors, NORM_EPS)
+        self.has_map = config.pseudo_map
+        self.first_block = 2 + len(config.map_channels) if config.pseudo_map else 1
         points, offsets = config.point_columns, config.offset_columns
-        scales = torch.ones(points + offsets)
+        linear, bias = weights.take("pillar_net.linear", (config.pillar_channels, points + offsets),
+                                    "pillar_net.norm")
+        self.layers = make_layers(config, weights)
+        per_cell = config.anchors_per_cell
+        self.codes, self.directions = (
+            weights.take(f"head.{name}", (per_cell * width, config.fpn_channels, 1, 1))
+            for name, width in (("codes", CODE), ("directions", BINS)))
+        weights.finish()
+        scales = np.ones(points + offsets, np.float32)
         scales[:2], scales[4 + offsets:] = config.xy_scale, config.id_scale
         order = [*range(4), *range(4 + offsets, points + offsets), *range(4, 4 + offsets)]
-        scaled = (linear.weight.detach() * scales)[:, order]  # points, then offsets
-        self.pillar_weights = packed(scaled[:, :, None].numpy())
-        bias = None if linear.bias is None else linear.bias.detach().numpy()
+        scaled = (linear * scales)[:, order]  # points, then offsets
+        self.pillar_weights = packed(scaled[:, :, None])
         self.pillar_bias = padded_bias(bias, len(self.pillar_weights) * BLOCK)
-        self.pillar_columns = padded(linear.out_features)
+        self.pillar_columns = padded(config.pillar_channels)
         self._empty: dict[Grid, list[Map]] = {}
 
-    def __call__(self, pillars: Pillars, maps: Tensor | None) -> Prediction:
+    def to(self, device: str) -> None:
+        """Stay on the CPU."""
+
+    def __call__(self, pillars: Pillars[np.ndarray], maps: np.ndarray | None) -> Prediction:
         """Predict at the anchors of all cells up to REACH from a point."""
         cells, features, logits = self.evaluate(pillars, maps, REACH)
-        head = self.head
-        anchors = torch.from_numpy(cells)[:, None] * head.per_cell + torch.arange(head.per_cell)
+        per_cell = self.config.anchors_per_cell
+        anchors = (cells[:, None] * per_cell + np.arange(per_cell)).ravel()
 
-        def boxes_at(chosen: Tensor) -> tuple[Tensor, Tensor]:
-            rows = features.at(cells[(chosen // head.per_cell).numpy()])
-            return head.boxes_of(torch.from_numpy(rows[:, :head.codes.in_channels]),
-                                 chosen % head.per_cell)
+        def boxes_at(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            rows = features.at(cells[chosen // per_cell])[:, :self.config.fpn_channels]
+            numbers = chosen % per_cell
+            return (_outputs_at(self.codes, per_cell, numbers, rows),
+                    _outputs_at(self.directions, per_cell, numbers, rows))
 
-        return Prediction(torch.from_numpy(logits).view(-1, head.classes), boxes_at,
-                          anchors.flatten())
+        return Prediction(logits.reshape(-1, len(self.config.classes)), boxes_at, anchors)
 
-    def evaluate(self, pillars: Pillars, maps: Tensor | None, reach: int | None
-                 ) -> tuple[np.ndarray, Map, np.ndarray]:
+    def evaluate(self, pillars: Pillars[np.ndarray], maps: np.ndarray | None,
+                 reach: int | None) -> tuple[np.ndarray, Map, np.ndarray]:
         """Compute the network up to `reach` cells of the head from a point; None: everywhere.
 
         Args:
             pillars: Of one cloud, which may be empty.
-            maps: As in PointPillars.features.
+            maps: As in prediction.Network.
 
         Returns:
             Cells (M,) int64 of the head's grid, row by row; the map that the head reads; and
@@ -110,15 +128,16 @@ class SparseNetwork:
         inputs = [self._pillar_map(pillars)]
         if self.has_map:
             assert maps is not None
-            inputs.append(_cluster_map(maps[0].numpy()))
+            inputs.append(_cluster_map(maps[0]))
         empty = self._empty_maps(pillars.grid)
         chosen = self._chosen([of.numbers[1:-1, 1:-1] > 0 for of in inputs], reach)
         *_, features, scores = self._run(inputs, chosen, empty)
-        logits = scores.rows[len(empty[-1].rows):, :self.head.scores.out_channels]
+        logits = scores.rows[len(empty[-1].rows):,
+                             :self.config.anchors_per_cell * len(self.config.classes)]
         return np.flatnonzero(chosen[-1]), features, np.ascontiguousarray(logits)
 
-    def _pillar_map(self, pillars: Pillars) -> Map:
-        points, offsets, cells = (x.numpy() for x in pillars[:3])
+    def _pillar_map(self, pillars: Pillars[np.ndarray]) -> Map:
+        points, offsets, cells = pillars[:3]
         occupied = np.zeros(pillars.grid, bool)
         occupied.ravel()[cells] = True
         numbers, index = kernels.number_cells(occupied, _blank(pillars.grid), 1)
@@ -185,6 +204,15 @@ class SparseNetwork:
             self._empty[grid] = [_background(*each) for each in zip(
                 maps, margins[count:], grids[count:])]
         return self._empty[grid]
+
+
+def _outputs_at(layer: Weights, per_cell: int, numbers: np.ndarray, rows: np.ndarray
+                ) -> np.ndarray:
+    """Return the outputs (N, C / per_cell) of a layer of the head at anchors number (N,) of their
+    cells, from the features (N, B) of these cells."""
+    weight = layer.weight.reshape(per_cell, -1, rows.shape[1])[numbers]
+    assert layer.bias is not None
+    return (weight @ rows[:, :, None])[:, :, 0] + layer.bias.reshape(per_cell, -1)[numbers]
 
 
 def _blank(grid: Grid) -> np.ndarray:

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from torch import nn
 
+from lidar_perception.detectors.layer_weights import LayerWeights
 from lidar_perception.detectors.matrix_kernel import BLOCK, packed, padded_bias
-from lidar_perception.detectors.pointpillars.network import FpnNeck, PointPillars
+from lidar_perception.detectors.pointpillars.config import NetworkConfig
 
 Grid = tuple[int, int]
 
@@ -100,44 +100,43 @@ def shrunk(mask: np.ndarray, scale: int) -> np.ndarray:
     return np.logical_or.reduce([rows[:, i::scale] for i in range(scale)])
 
 
-def make_layers(network: PointPillars) -> list[Layer]:
-    """Return the layers of a fused network with an FpnNeck that adds; the last gives the scores of
-    the head, the one before it what the head reads. Map 0 is of the pillars, map 1 of the clusters
-    if the network has that branch, and then comes the map of each layer."""
+def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
+    """Return the layers of a network with an FPN neck that adds; the last gives the scores of the
+    head, the one before it what the head reads. Map 0 is of the pillars, map 1 of the clusters if
+    the network has that branch, and then comes the map of each layer."""
     layers: list[Layer] = []
-    inputs = 1 if network.map_net is None else 2
+    widths = [config.pillar_channels, 3][:2 if config.pseudo_map else 1]  # of each map
 
-    def add(convolution: nn.Module, sources: Sequence[int], relu: bool = True,
-            coarse: int | None = None, scale: int = 1) -> int:
-        assert isinstance(convolution, nn.Conv2d)
-        widths = [network.pillar_net.linear.out_features if source == 0 else 3
-                  if source < inputs else outputs[source - inputs] for source in sources]
-        parts = convolution.weight.detach().flatten(2).split(widths, dim=1)
-        weights = tuple(packed(part.numpy()) for part in parts)
-        own = None if convolution.bias is None else convolution.bias.detach().numpy()
-        layers.append(Layer(tuple(sources), weights, padded_bias(own, len(weights[0]) * BLOCK),
-                            convolution.stride[0], 0.0 if relu else -math.inf, coarse, scale))
-        outputs.append(convolution.out_channels)
-        return inputs + len(layers) - 1
+    def add(name: str, sources: Sequence[int], out: int, kernel: int = 3, stride: int = 1,
+            normed: bool = True, coarse: int | None = None, scale: int = 1) -> int:
+        read = [widths[source] for source in sources]
+        layer, norm = (f"{name}.0", f"{name}.1") if normed else (name, None)
+        weight, bias = tensors.take(layer, (out, sum(read), kernel, kernel), norm)
+        parts = np.split(weight.reshape(out, sum(read), -1), np.cumsum(read)[:-1], axis=1)
+        weights = tuple(map(packed, parts))
+        layers.append(Layer(tuple(sources), weights, padded_bias(bias, len(weights[0]) * BLOCK),
+                            stride, 0.0 if normed else -math.inf, coarse, scale))
+        widths.append(out)
+        return len(widths) - 1
 
-    outputs: list[int] = []
     sources = [0]
-    if network.map_net is not None:
+    if config.pseudo_map:
         last = 1
-        for module in network.map_net:
-            last = add(next(module.children()), [last])
+        for i, out in enumerate(config.map_channels):
+            last = add(f"map_net.{i}", [last], out)
         sources = [0, last]
     levels = []
-    for block in network.blocks:
-        for module in block.children():
-            sources = [add(next(module.children()), sources)]
+    for i, (out, more, stride) in enumerate(zip(config.block_channels, config.block_layers,
+                                                config.block_strides)):
+        for k in range(1 + more):
+            sources = [add(f"blocks.{i}.{k}", sources, out, stride=1 if k else stride)]
         levels += sources
-    neck = network.neck
-    assert isinstance(neck, FpnNeck)
     joined: int | None = None
-    for lateral, level, scale in zip(reversed(neck.laterals), reversed(levels),
-                                     [1, *reversed(neck.scales)]):
-        joined = add(lateral, [level], relu=False, coarse=joined, scale=scale)
+    scales = [*config.block_strides[1:], 1]
+    for i in reversed(range(len(levels))):
+        joined = add(f"neck.laterals.{i}", [levels[i]], config.fpn_channels, 1, normed=False,
+                     coarse=joined, scale=scales[i])
     assert joined is not None
-    add(network.head.scores, [add(next(neck.out.children()), [joined])], relu=False)
+    features = add("neck.out", [joined], config.fpn_channels)
+    add("head.scores", [features], config.anchors_per_cell * len(config.classes), 1, normed=False)
     return layers

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidar_perception.detectors.pointpillars.box_coder import encode
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 
 BACKGROUND, IGNORED = -1, -2
@@ -18,7 +17,7 @@ BACKGROUND, IGNORED = -1, -2
 
 class Targets(NamedTuple):
     """What B clouds shall give: labels (B, A) int64, a class of the config, BACKGROUND or IGNORED;
-    codes (B, A, 7) and bins (B, A) of box_coder, 0 where the label is no class."""
+    codes (B, A, 7) and bins (B, A) of encode(), 0 where the label is no class."""
 
     labels: Tensor
     codes: Tensor
@@ -33,6 +32,25 @@ class SparseTargets(NamedTuple):
     labels: np.ndarray
     codes: np.ndarray
     bins: np.ndarray
+
+
+def encode(boxes: Tensor, anchors: Tensor, offset: float) -> tuple[Tensor, Tensor]:
+    """Return codes (N, 7) float32 and bins (N,) int64, 0 or 1, of boxes (N, 7) [x y z l w h yaw]
+    relative to anchors (N, 7): the inverse of box_coder.decode. l w h must be above 0."""
+    diagonal = torch.hypot(anchors[:, 3], anchors[:, 4])
+    codes = torch.stack([
+        (boxes[:, 0] - anchors[:, 0]) / diagonal,
+        (boxes[:, 1] - anchors[:, 1]) / diagonal,
+        (boxes[:, 2] - anchors[:, 2]) / anchors[:, 5],
+        *torch.log(boxes[:, 3:6] / anchors[:, 3:6]).unbind(1),
+        boxes[:, 6] - anchors[:, 6]], dim=1)
+    return codes, direction(boxes[:, 6], offset)
+
+
+def direction(yaw: Tensor, offset: float) -> Tensor:
+    """Return 0 for yaw in [offset, offset + pi), 1 for the other half of the circle; int64."""
+    turned = torch.remainder(yaw - offset, 2 * math.pi)
+    return (turned >= math.pi).long()
 
 
 def assign(anchors: Tensor, config: NetworkConfig, boxes: Tensor, labels: Tensor) -> Targets:

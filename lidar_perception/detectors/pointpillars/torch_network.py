@@ -1,27 +1,18 @@
-"""PointPillars in inference mode: layers in torch or in the sparse engine."""
+"""PointPillars in torch, in inference mode."""
 
 from __future__ import annotations
 
-from typing import Protocol
-
+import numpy as np
 import torch
-from torch import Tensor
 
-from lidar_perception.detectors.devices import CPU, choose_dtype
-from lidar_perception.detectors.pointpillars.network import PointPillars, Prediction, fused
+from lidar_perception.detectors.devices import CPU, choose_dtype, uses_16_bits
+from lidar_perception.detectors.layer_weights import arrays_of
+from lidar_perception.detectors.pointpillars.network import PointPillars, fused
 from lidar_perception.detectors.pointpillars.pillars import Pillars
+from lidar_perception.detectors.pointpillars.prediction import Prediction
 from lidar_perception.detectors.pointpillars.sparse import SparseNetwork, unsupported
+from lidar_perception.runs.threads import set_torch_threads
 from lidar_perception.types import InputError
-
-
-class Network(Protocol):
-    """A network that a PointPillarsProposer can run: a TorchNetwork or an OnnxNetwork."""
-
-    def to(self, device: torch.device) -> None:
-        """Move to another device if the network can."""
-
-    def __call__(self, pillars: Pillars, maps: Tensor | None) -> Prediction:
-        """Return the outputs for one cloud; maps as in PointPillars.features."""
 
 
 class TorchNetwork:
@@ -36,35 +27,47 @@ class TorchNetwork:
         InputError: the engine is sparse and cannot run this network.
     """
 
-    def __init__(self, network: PointPillars, device: torch.device = CPU, amp: str = "off",
+    has_fixed_range = False
+
+    def __init__(self, network: PointPillars, device: str = CPU, amp: str = "off",
                  engine: str = "torch"):
-        network = fused(network)
+        set_torch_threads()
         self.sparse = _make_sparse(network, amp, engine)
-        self.network, self.amp = network.to(device), amp
+        self.network, self.amp, self.device = fused(network).to(device), amp, device
 
-    def to(self, device: torch.device) -> None:
+    def to(self, device: str) -> None:
         self.network.to(device)
+        self.device = device
 
-    def __call__(self, pillars: Pillars, maps: Tensor | None) -> Prediction:
-        device = pillars.points.device
-        if self.sparse and device == CPU:
+    @torch.inference_mode()
+    def __call__(self, pillars: Pillars[np.ndarray], maps: np.ndarray | None) -> Prediction:
+        if self.sparse and self.device == CPU:
             return self.sparse(pillars, maps)
-        numbers = choose_dtype(self.amp, device)
-        with torch.autocast(device.type, numbers, enabled=numbers is not None):
-            features = self.network.features(pillars, maps).float()
+        points, offsets, cells = (torch.from_numpy(x).to(self.device) for x in pillars[:3])
+        own_maps = None if maps is None else torch.from_numpy(maps).to(self.device)
+        numbers = choose_dtype(self.amp, self.device)
+        with torch.autocast(torch.device(self.device).type, numbers, enabled=numbers is not None):
+            features = self.network.features(
+                Pillars(points, offsets, cells, *pillars[3:]), own_maps).float()
         head = self.network.head
-        return Prediction(head.logits(features)[0],
-                          lambda anchors: head.boxes_at(features, anchors))
+
+        @torch.inference_mode()
+        def boxes_at(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            codes, directions = head.boxes_at(features, torch.from_numpy(chosen).to(self.device))
+            return codes.float().cpu().numpy(), directions.float().cpu().numpy()
+
+        return Prediction(head.logits(features)[0].float().cpu().numpy(), boxes_at)
 
 
 def _make_sparse(network: PointPillars, amp: str, engine: str) -> SparseNetwork | None:
     if engine == "torch":
         return None
-    reason = unsupported(network)
-    if not reason and choose_dtype(amp, CPU):
+    config = network.pillar_net.config
+    reason = unsupported(config)
+    if not reason and uses_16_bits(amp):
         reason = "it works in float32, and amp asks for 16 bits"
     if not reason:
-        return SparseNetwork(network)
+        return SparseNetwork(config, arrays_of(network))
     if engine == "sparse":
         raise InputError(f"the sparse engine cannot run this network: {reason}; choose the engine "
                          "auto or torch")

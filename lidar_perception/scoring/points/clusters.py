@@ -16,8 +16,9 @@ from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.open import default_params
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
-from lidar_perception.detectors.pointnet.network import fused, load_pointnet
-from lidar_perception.detectors.pointnet.predict import Predictions, predict
+from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
+from lidar_perception.detectors.pointnet.params import PointNetDetectorParams, PointNetParams
+from lidar_perception.detectors.pointnet.predict import Predictions
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.param_fields import with_values
@@ -114,8 +115,9 @@ def by_network(weights: Path, settings: Mapping[str, Any],
     settings: parameters of ground and clustering by their dotted names, where they are not those
     that the network was trained with.
     """
-    network = fused(load_pointnet(weights)[1])
-    config, background = network.config, len(network.config.classes)
+    classifier = load_pointnet_detector(weights, "cpu", PointNetDetectorParams(
+        pointnet=PointNetParams(warm_up=False))).classifier
+    config, background = classifier.config, len(classifier.classes)
     params = with_values(default_params(weights), settings)
 
     def measure(frame: Frame) -> tuple[np.ndarray, np.ndarray] | None:
@@ -137,7 +139,7 @@ def by_network(weights: Path, settings: Mapping[str, Any],
         labels = unknown_where(labels, made, hidden(made.points[:, :3]), background)
         points = point_labels(seen.xyz, truth.boxes, truth.class_ids, config.classes)
         points[(points == background) & hidden(seen.xyz)] = UNKNOWN
-        return confusions(made, labels, predict(network, made), points, ids, config.classes)
+        return confusions(made, labels, classifier.predict(made), points, ids, config.classes)
     return measure
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from lidar_perception.camera import Calibration
 from lidar_perception.detectors.normalized_view import restore_detections
 from lidar_perception.detectors.params import MIN_SCORE
-from lidar_perception.detectors.pointnet.box_head import BoxTargets, cluster_loss, encode
+from lidar_perception.detectors.pointnet.box_head import BoxTargets, encode
 from lidar_perception.detectors.pointnet.calibration import calibrate, calibration_error
 from lidar_perception.detectors.pointnet.clusters import (
     ClusterInput,
@@ -24,8 +24,10 @@ from lidar_perception.detectors.pointnet.clusters import (
     network_input,
 )
 from lidar_perception.detectors.pointnet.config import PointNetConfig
+from lidar_perception.detectors.pointnet.losses import cluster_loss
 from lidar_perception.detectors.pointnet.network import PointNet, make_pointnet
-from lidar_perception.detectors.pointnet.predict import found, outputs_of, predict
+from lidar_perception.detectors.pointnet.predict import found, predict
+from lidar_perception.detectors.pointnet.torch_network import TorchPointNet, outputs_of
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import show_progress
@@ -239,7 +241,7 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
         calibrate(network, logits, torch.from_numpy(labels))
     report, predictions = DetectionReport(), []
     for scene in show_progress(scenes, "validating", len(scenes)):
-        predictions.append(predict(network, scene.clusters))
+        predictions.append(predict(TorchPointNet(network), scene.clusters))
         boxes = found(predictions[-1], config, [MIN_SCORE] * len(config.classes))
         boxes = restore_detections(boxes, SensorPoseParams(height=scene.height))
         report.update(Detected(scene.name, scene.truth, boxes, scene.calibration))

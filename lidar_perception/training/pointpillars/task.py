@@ -29,7 +29,7 @@ from lidar_perception.detectors.pointpillars.network import (
     make_network,
 )
 from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
-from lidar_perception.detectors.pointpillars.pillars import make_pillars
+from lidar_perception.detectors.pointpillars.pillar_batch import make_pillar_batch
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
 from lidar_perception.detectors.pointpillars.targets import (
     BACKGROUND,
@@ -127,7 +127,7 @@ class ScenePreparation:
 
     @cached_property
     def _anchors(self) -> Tensor:
-        return make_anchors(self.config)
+        return torch.from_numpy(make_anchors(self.config))
 
     def __getstate__(self) -> dict:
         return {k: v for k, v in self.__dict__.items() if k not in ("_objects", "_anchors")}
@@ -215,10 +215,11 @@ def _assign_targets(boxes: np.ndarray, labels: np.ndarray, counted: np.ndarray, 
 
 def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
     """Return loss(network, samples) -> (total, parts), see Task."""
-    classes = anchor_classes(config, device)
+    classes = torch.from_numpy(anchor_classes(config)).to(device)
 
     def loss(network: nn.Module, samples: Sequence[Sample]) -> tuple[Tensor, dict[str, Tensor]]:
-        pillars = make_pillars([torch.from_numpy(s.points).to(device) for s in samples], config)
+        pillars = make_pillar_batch([torch.from_numpy(s.points).to(device) for s in samples],
+                                    config)
         cluster_maps = [s.cluster_map for s in samples if s.cluster_map is not None]
         maps = torch.from_numpy(np.stack(cluster_maps)).to(device) if cluster_maps else None
         targets = dense([sample.targets for sample in samples], len(classes), device)
@@ -289,7 +290,8 @@ def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batc
     reported: set[str] = set()
 
     def validate(module: PointPillars) -> Validation:
-        proposer = PointPillarsProposer(TorchNetwork(module, device), Header(config), device)
+        proposer = PointPillarsProposer(TorchNetwork(module, str(device)), Header(config),
+                                        str(device))
         detector = PointPillarsDetector(proposer, VALIDATION_PARAMS)
         report = validate_detector(detector, validation, batches.jobs)
         report_skipped(report.skipped, len(report.frames), reported)

@@ -100,7 +100,8 @@ class PointPillarsTrainer:
             step = measure_step(network, make_loss(reduced, device), lambda: [
                 prepare_pasted(scene, np.random.default_rng(0)) for scene in chosen],
                 params, device)
-        proposer = PointPillarsProposer(TorchNetwork(network, device), Header(self.config), device)
+        proposer = PointPillarsProposer(TorchNetwork(network, str(device)), Header(self.config),
+                                        str(device))
         detector = PointPillarsDetector(proposer, VALIDATION_PARAMS)
         frame = find_readable_frame(self._make_reader(held_out), lambda frame: detect_in_frame(
             frame, detector).problem is None)

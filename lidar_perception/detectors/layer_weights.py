@@ -1,0 +1,72 @@
+"""Weights of layers from the tensors of a checkpoint, with batch norms folded into the layers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Misfit(ValueError):
+    """The tensors are not those of the network. checkpoint.load(), which needs torch, names the
+    first one that differs."""
+
+
+class Weights(NamedTuple):
+    """A convolution (O, I, kh, kw) or linear layer (O, I) with its bias (O,) or None, float32."""
+
+    weight: np.ndarray
+    bias: np.ndarray | None
+
+
+class LayerWeights:
+    """The layers of a network by name; each is taken once.
+
+    Args:
+        tensors: name -> array, the state_dict of a network in torch.
+        eps: of the batch norms.
+    """
+
+    def __init__(self, tensors: Mapping[str, np.ndarray], eps: float):
+        self.tensors, self.eps = dict(tensors), eps
+
+    def take(self, name: str, shape: tuple[int, ...], norm: str | None = None) -> Weights:
+        """Return a layer.
+
+        Args:
+            shape: of its weight.
+            norm: name of the batch norm behind a layer without bias. Where the norm is folded
+                already, the layer has a bias and there is no norm.
+
+        Raises:
+            Misfit: it is not there, or has another shape.
+        """
+        weight = self.array(f"{name}.weight", shape)
+        if norm is None or f"{norm}.weight" not in self.tensors:
+            return Weights(weight, self.array(f"{name}.bias", shape[:1]))
+        scale, shift, mean, variance = (self.array(f"{norm}.{part}", shape[:1]) for part in (
+            "weight", "bias", "running_mean", "running_var"))
+        count = self.tensors.pop(f"{norm}.num_batches_tracked", None)
+        if count is None or count.shape or count.dtype != np.int64:
+            raise Misfit(f"{norm}.num_batches_tracked")
+        factor = 1 / np.sqrt(variance + np.float32(self.eps))  # in the order of torch, to the bit
+        return Weights(weight * (scale * factor).reshape(-1, *[1] * (len(shape) - 1)),
+                       (0 - mean) * factor * scale + shift)
+
+    def array(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+        """Return a tensor of floats as float32, or raise Misfit."""
+        found = self.tensors.pop(name, None)
+        if found is None or found.shape != shape or not np.issubdtype(found.dtype, np.floating):
+            raise Misfit(name)
+        return found.astype(np.float32)
+
+    def finish(self) -> None:
+        """Raise Misfit if a tensor has not been taken."""
+        for name in self.tensors:
+            raise Misfit(name)
+
+
+def arrays_of(network: Any) -> dict[str, np.ndarray]:
+    """Return the state_dict of a network of torch as arrays."""
+    return {name: value.detach().cpu().numpy() for name, value in network.state_dict().items()}

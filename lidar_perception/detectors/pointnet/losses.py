@@ -1,0 +1,45 @@
+"""Loss of the cluster network (paper C, Eq. 18)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from lidar_perception.detectors.pointnet.box_head import BoxTargets, Outputs
+
+BOX_WEIGHT, YAW_BIN_WEIGHT = 1.0, 0.3  # lambda of Eq. 18, of boxes and of yaw bins
+SMOOTH = 0.2       # m, and like numbers: from here on the box loss is linear
+
+
+class Losses(NamedTuple):
+    """Scalars; total is the weighted sum of the others."""
+
+    total: Tensor
+    classes: Tensor
+    boxes: Tensor
+    yaw_bins: Tensor
+
+
+def cluster_loss(outputs: Outputs[Tensor], labels: Tensor, targets: BoxTargets[Tensor],
+                 has_box: Tensor, weights: Tensor | None = None) -> Losses:
+    """Cross entropy of labels (B,), K for background and -1 for those of which nothing is said,
+    with a weight (K + 1,) for each class; smooth L1 of the boxes of those that have one (B,) bool,
+    and cross entropy of their yaw bins. targets: of B rows."""
+    classes = functional.cross_entropy(outputs.logits.float(), labels, weight=weights,
+                                       ignore_index=-1)
+    if not has_box.any():
+        zero = sum((x.sum() for x in outputs), classes.new_zeros(())) * 0.0
+        return Losses(classes + zero, classes, zero, zero)
+    bins = targets.yaw_bins[has_box]
+    residuals = outputs.yaw_residuals[has_box].gather(1, bins[:, None])[:, 0]
+    found = torch.cat([outputs.centres[has_box], outputs.sizes[has_box], residuals[:, None]], 1)
+    wanted = torch.cat([targets.centres[has_box], targets.sizes[has_box],
+                        targets.yaw_residuals[has_box][:, None]], 1)
+    boxes = functional.smooth_l1_loss(found.float(), wanted, beta=SMOOTH,
+                                      reduction="none").sum(dim=1).mean()
+    yaw_bins = functional.cross_entropy(outputs.yaw_bins[has_box].float(), bins)
+    total = classes + BOX_WEIGHT * boxes + YAW_BIN_WEIGHT * yaw_bins
+    return Losses(total, classes, boxes, yaw_bins)

@@ -1,0 +1,49 @@
+"""Points of several clouds to pillars, in torch, on any device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lidar_perception.detectors.pointpillars.config import NetworkConfig
+from lidar_perception.detectors.pointpillars.pillars import Pillars
+
+
+def make_pillar_batch(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillars[Tensor]:
+    """Return the pillars of clouds, each (N_b, config.point_columns) float32 on one device; see
+    make_pillars."""
+    points = torch.cat(list(clouds))
+    sizes = torch.tensor([len(cloud) for cloud in clouds], device=points.device)
+    sample = torch.repeat_interleave(sizes)
+    low, high = points.new_tensor(config.low), points.new_tensor(config.high)
+    inside = ((points[:, :3] >= low) & (points[:, :3] < high)).all(dim=1)  # NaN is not
+    inside &= torch.isfinite(points[:, 3:]).all(dim=1)
+    if not inside.all():
+        points, sample = points[inside], sample[inside]
+    height, width = config.grid
+    column = ((points[:, 0] - low[0]) / config.cell).long().clamp_(max=width - 1)
+    row = ((points[:, 1] - low[1]) / config.cell).long().clamp_(max=height - 1)
+    cells = (sample * height + row) * width + column
+    if config.max_points:
+        kept = keep_first_per_cell(cells, config.max_points)
+        points, cells, column, row = points[kept], cells[kept], column[kept], row[kept]
+    middle = torch.stack([points[:, 0] - ((column + 0.5) * config.cell + low[0]),
+                          points[:, 1] - ((row + 0.5) * config.cell + low[1]),
+                          points[:, 2] - (low[2] + high[2]) / 2], dim=1)
+    # Means of offsets: their sums stay small, so the order of the points hardly matters.
+    counted = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)
+    sums = counted.new_zeros(len(clouds) * height * width, 4).index_add_(0, cells, counted)[cells]
+    offsets = torch.cat([middle - sums[:, :3] / sums[:, 3:],
+                         middle[:, :config.offset_columns - 3]], dim=1)
+    return Pillars(points, offsets, cells, len(clouds), config.grid)
+
+
+def keep_first_per_cell(cells: Tensor, count: int) -> Tensor:
+    """Ascending indices (M,) of the first `count` points of each cell, in the cloud's order."""
+    ordered, indices = torch.sort(cells, stable=True)
+    _, sizes = torch.unique_consecutive(ordered, return_counts=True)
+    starts = torch.repeat_interleave(torch.cumsum(sizes, 0) - sizes, sizes)
+    rank = torch.arange(len(cells), device=cells.device) - starts
+    return torch.sort(indices[rank < count]).values
