@@ -50,9 +50,8 @@ class LayerWeights:
         count = self.tensors.pop(f"{norm}.num_batches_tracked", None)
         if count is None or count.shape or count.dtype != np.int64:
             raise Misfit(f"{norm}.num_batches_tracked")
-        factor = 1 / np.sqrt(variance + np.float32(self.eps))  # in the order of torch, to the bit
-        return Weights(weight * (scale * factor).reshape(-1, *[1] * (len(shape) - 1)),
-                       (0 - mean) * factor * scale + shift)
+        scale = scale / np.sqrt(variance + np.float32(self.eps))
+        return Weights(weight * scale.reshape(-1, *[1] * (len(shape) - 1)), shift - mean * scale)
 
     def array(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """Return a tensor of floats as float32, or raise Misfit."""

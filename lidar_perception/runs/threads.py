@@ -24,8 +24,8 @@ def set_thread_count(count: int) -> None:
 
 def set_torch_threads() -> None:
     """Apply set_thread_count() to torch if torch is loaded."""
-    if _thread_count and "torch" in sys.modules:
-        import torch
+    torch = sys.modules.get("torch")
+    if _thread_count and torch is not None:
         torch.set_num_threads(_thread_count)
 
 

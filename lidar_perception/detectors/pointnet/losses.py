@@ -25,7 +25,7 @@ class Losses(NamedTuple):
 
 def cluster_loss(outputs: Outputs[Tensor], labels: Tensor, targets: BoxTargets[Tensor],
                  has_box: Tensor, weights: Tensor | None = None) -> Losses:
-    """Cross entropy of labels (B,), K for background and -1 for those of which nothing is said,
+    """Cross entropy of labels (B,), K for background and -1 for unknown labels,
     with a weight (K + 1,) for each class; smooth L1 of the boxes of those that have one (B,) bool,
     and cross entropy of their yaw bins. targets: of B rows."""
     classes = functional.cross_entropy(outputs.logits.float(), labels, weight=weights,

@@ -65,8 +65,11 @@ def found(predictions: Predictions, config: PointNetConfig, least: Sequence[floa
 
 def predict(network: Network, clusters: Clusters, seed: int = 0,
             labels: np.ndarray | None = None) -> Predictions:
-    """Return the predictions for K clusters, K may be 0; labels (K,): the classes that are asked
-    about, instead of the likeliest."""
+    """Return the predictions for K clusters; K may be 0.
+
+    Args:
+        labels: (K,) int64, the class to predict the box for; None: the likeliest class.
+    """
     config, classes = network.config, len(network.config.classes)
     if len(clusters) == 0:
         return Predictions(np.zeros((0, classes + 1), np.float32), np.zeros(0, np.int64),
