@@ -75,7 +75,7 @@ def test_numbers_that_numpy_lacks_are_read_by_torch(tmp_path):
     tensors = {name: value.bfloat16() if value.ndim > 1 else value
                for name, value in lively(config).state_dict().items()}
     save_file({name: value.contiguous() for name, value in tensors.items()}, path,
-              {"lidar_perception": Header(config).text()})
+              {"lidar_perception": Header(config).to_json()})
     detector = open_detector(path, "cpu", settings={"pointpillars.warm_up": False})
     assert isinstance(detector.proposer.network, TorchNetwork)
     assert detector.proposer.network.sparse is not None
