@@ -1,1 +1,1 @@
-"""lidar_studio: label drives, and view recordings and running nodes, in the browser."""
+"""Labelling of drives, and viewing of recordings and running nodes, in the browser."""

@@ -1,8 +1,8 @@
-"""A scripted annotator who knows the truth and does what a person would on the page, counted: how
-many actions it takes until every pedestrian of a drive is right.
+"""Simulated annotator: a script that knows the ground truth labels the pedestrians of a drive as a
+person would on the page, and counts the actions.
 
-Counted are clicks, keys and drags that change labels or choose among them. Looking at frames, which
-labelling by hand needs as well, is not.
+Clicks, keys and drags that change or select labels are counted. Looking through frames is not, as
+labelling by hand needs it as well.
 """
 
 from __future__ import annotations
@@ -15,22 +15,21 @@ import numpy as np
 
 from lidar_perception.geometry import bev_iou, points_in_box
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
-from lidar_studio.proposing import REACH
+from lidar_studio.proposer import SAME_TRACK_DISTANCE_M
 from lidar_studio.session import Session
-from lidar_studio.state import ACCEPTED, PROPOSED, Track, next_uncertain
-from lidar_studio.survey import Look
+from lidar_studio.state import ACCEPTED, PROPOSED, Track, find_next_uncertain
+from lidar_studio.survey import FrameSurvey
 
 Array = np.ndarray[Any, Any]
-OVERLAP, CENTRE = 0.7, 0.2  # a box is right from this overlap seen from above, or metres, on
-PLACE, ADJUST = 1, 3        # actions of a box made by hand, and of one put right in all
+MIN_OVERLAP, MAX_CENTRE_ERROR_M = 0.7, 0.2  # a box is right with either, both in BEV
+PLACE_ACTIONS, ADJUST_ACTIONS = 1, 3  # to place a box by hand; to correct place, size and heading
 PERSON = CLASSES[PEDESTRIAN]
-REPORTED = 0.4              # score of a detection that is shown where there are no tracks
-ROUNDS = 1000               # more actions than this at one person are a fault of ours
+MIN_SHOWN_SCORE = 0.4  # of a detection, when labelling without tracks
+MAX_ROUNDS = 1000      # corrections of one person; more indicate a bug
 
 
 class Truth:
-    """The labelled pedestrians of a drive, those that its camera sees where it has one: by track
-    id, by frame, a box (7,)."""
+    """The labelled pedestrians of a drive. people: boxes (7,) by track id and frame."""
 
     def __init__(self, session: Session) -> None:
         self.people: dict[int, dict[int, Array]] = {}
@@ -44,39 +43,41 @@ class Truth:
 
     @property
     def boxes(self) -> int:
-        """How many there are."""
+        """Number of labelled boxes."""
         return sum(map(len, self.people.values()))
 
-    def seen(self, frame: int, box: Array) -> bool:
-        """Whether a box (7,) lies where objects are labelled."""
+    def is_labelled_place(self, frame: int, box: Array) -> bool:
+        """Return True if objects at a box (7,) would be labelled: in the camera's view, if any."""
         camera = self._cameras[frame]
         return camera is None or bool(camera.in_view(box[None, :3])[0])
 
-    def person(self, track: Track) -> int | None:
-        """Whom most of a track's boxes are, or None."""
+    def match_person(self, track: Track) -> int | None:
+        """Return the id of the person at most of a track's boxes, or None."""
         votes: Counter[int] = Counter()
         for f, box in track.boxes.items():
             centre = np.array(box.values)
-            near = [(distance(b[f], centre), n) for n, b in self.people.items() if f in b]
-            if near and min(near)[0] <= REACH:
-                votes[min(near)[1]] += 1
-        labelled = sum(self.seen(f, np.array(b.values)) for f, b in track.boxes.items())
+            nearest = [(centre_distance(b[f], centre), n) for n, b in self.people.items() if f in b]
+            if nearest and min(nearest)[0] <= SAME_TRACK_DISTANCE_M:
+                votes[min(nearest)[1]] += 1
+        labelled = sum(self.is_labelled_place(f, np.array(b.values))
+                       for f, b in track.boxes.items())
         number, count = next(iter(votes.most_common(1)), (-1, 0))
         return number if count > 0 and 2 * count >= labelled else None
 
 
-def distance(one: Array, other: Array) -> float:
-    """Metres between the centres of two boxes (7,), seen from above."""
+def centre_distance(one: Array, other: Array) -> float:
+    """Compute the BEV distance between the centres of two boxes (7,), in metres."""
     return float(np.hypot(*(one[:2] - other[:2])))
 
 
 def is_right(box: Array, true: Array) -> bool:
-    """Whether a box (7,) is good enough."""
-    return distance(box, true) <= CENTRE or bool(bev_iou(box[None], true[None])[0, 0] >= OVERLAP)
+    """Return True if a box (7,) is close enough to the true one."""
+    overlap = bev_iou(box[None], true[None])[0, 0]
+    return centre_distance(box, true) <= MAX_CENTRE_ERROR_M or bool(overlap >= MIN_OVERLAP)
 
 
 class Annotator:
-    """Labels the pedestrians of a session whose drive was surveyed. counts: actions by kind."""
+    """Labels the pedestrians of a session with proposals. counts: actions by kind."""
 
     def __init__(self, session: Session) -> None:
         self.session, self.truth = session, Truth(session)
@@ -84,8 +85,9 @@ class Annotator:
         self.looked_at: set[int] = set()  # ids of proposals
         self._own: dict[int, int] = {}  # person -> id of the track
 
-    def work(self) -> dict[str, Any]:
-        """Label until every pedestrian is right; what it took. InputError where that fails."""
+    def run(self) -> dict[str, Any]:
+        """Label until every pedestrian is right; return the counts. InputError if that fails."""
+        surveys = self.session.proposer.surveys or []
         self._decide()
         for number in sorted(self.truth.people):
             self._find(number)
@@ -97,25 +99,26 @@ class Annotator:
         return {"people": len(self.truth.people), "boxes": self.truth.boxes,
                 "looked_at": len(self.looked_at), "actions": self.actions,
                 "kinds": dict(sorted(self.counts.items())),
-                "corrections_in_full": self.actions + (ADJUST - 1) * self.counts["drag"],
-                "by_hand": (PLACE + ADJUST) * self.truth.boxes,
-                "without_tracks": without_tracks(self.session.proposer.looks or [], self.truth)}
+                "corrections_in_full": self.actions + (ADJUST_ACTIONS - 1) * self.counts["drag"],
+                "by_hand": (PLACE_ACTIONS + ADJUST_ACTIONS) * self.truth.boxes,
+                "without_tracks": count_actions_without_tracks(surveys, self.truth)}
 
     @property
     def actions(self) -> int:
-        """So far."""
+        """Number of actions so far."""
         return sum(self.counts.values())
 
     def _do(self, kind: str, **action: Any) -> None:
         self.session.do(action, "annotator")
-        self.session.wait()  # a seed is followed
+        self.session.wait()  # until a seed is tracked
         self.counts[kind] += 1
 
     def _decide(self) -> None:
-        """Accept every proposed pedestrian who is one, as the frames are looked through: a key
-        each, while the pointer is on the box. A second track of a person is joined to the first."""
-        while (track := next_uncertain(self.session.state, among=self._is_new)) is not None:
-            person = self.truth.person(track)
+        """Accept every proposed pedestrian that is one, with one key each while the pointer is on
+        the box, and merge further tracks of the same person with the first."""
+        while (track := find_next_uncertain(self.session.state,
+                                            condition=self._is_new)) is not None:
+            person = self.truth.match_person(track)
             self.looked_at.add(track.id)
             if person is None:
                 continue
@@ -125,14 +128,12 @@ class Annotator:
                 self._do("key: merge", do="merge", tracks=[self._own[person], track.id])
 
     def _is_new(self, track: Track) -> bool:
-        """Whether a track is to be looked at: called a pedestrian, some of it where pedestrians are
-        labelled, and not looked at before."""
+        """Return True for a pedestrian track that was not looked at, where objects are labelled."""
         return (track.class_name == PERSON and track.id not in self.looked_at and any(
-            self.truth.seen(f, np.array(b.values)) for f, b in track.boxes.items()))
+            self.truth.is_labelled_place(f, np.array(b.values)) for f, b in track.boxes.items()))
 
     def _reject_rest(self) -> None:
-        """What was not accepted, at once: only pedestrians are listed, and the rest of them is
-        rejected."""
+        """List only pedestrians and reject all remaining proposals with one key."""
         if any(t.state == PROPOSED and t.id in self.looked_at
                for t in self.session.state.tracks.values()):
             self.counts["click: only pedestrians"] += 1
@@ -142,13 +143,13 @@ class Annotator:
         return self.session.state.tracks[self._own[person]]
 
     def _find(self, person: int) -> None:
-        """Where a person has no track: one of another class gets the right one, else click where
-        the person is nearest, or place a box there."""
+        """Give a person without a track one: correct the class of a proposal, else click where the
+        person is nearest, else place a box there."""
         if person in self._own:
             return
         boxes = self.truth.people[person]
         for track in self.session.state.tracks.values():
-            if track.state == PROPOSED and self.truth.person(track) == person:
+            if track.state == PROPOSED and self.truth.match_person(track) == person:
                 self._own[person] = track.id
                 self.counts["click: select"] += 1
                 self._do("key: class", do="class", track=track.id, **{"class": PERSON})
@@ -163,34 +164,34 @@ class Annotator:
             self._own[person] = self.session.state.next_id
             self._do("place", do="add", frame=frame, box=boxes[frame].tolist(),
                      **{"class": PERSON})
-            self.counts["adjust"] += ADJUST
+            self.counts["adjust"] += ADJUST_ACTIONS
 
     def _point(self, frame: int, box: Array) -> list[float]:
-        """A point of the person that has a cluster, near the middle."""
-        scan = self.session.drive.clouds(frame)
+        """Return a clustered point of the person near the centre of the box."""
+        scan = self.session.drive.load_scan(frame)
         inside = np.flatnonzero(points_in_box(scan.xyz, box, 0.1) & (scan.cluster_ids > 0))
         if len(inside) == 0:
             raise InputError("there is no cluster to click")
-        apart = np.linalg.norm(scan.xyz[inside] - box[:3], axis=1)
-        return [float(v) for v in scan.xyz[inside[apart.argmin()]]]
+        distances = np.linalg.norm(scan.xyz[inside] - box[:3], axis=1)
+        return [float(v) for v in scan.xyz[inside[distances.argmin()]]]
 
     def _finish(self, person: int) -> None:
-        """Take away what is too much, then put right the worst box, until none is wrong."""
+        """Remove extra boxes, then correct the worst box, until every box is right."""
         boxes = self.truth.people[person]
-        for _ in range(ROUNDS):
+        for _ in range(MAX_ROUNDS):
             self._trim(person)
             track = self._track_of(person)
-            wrong = {f: distance(b, np.array(track.boxes[f].values)) if f in track.boxes else np.inf
-                     for f, b in boxes.items()
-                     if f not in track.boxes or not is_right(np.array(track.boxes[f].values), b)}
+            current = {f: np.array(box.values) for f, box in track.boxes.items()}
+            wrong = {f: centre_distance(b, current[f]) if f in current else np.inf
+                     for f, b in boxes.items() if f not in current or not is_right(current[f], b)}
             if not wrong:
                 return
-            ranks = {f: (_rank(track, f, error), -f) for f, error in wrong.items()}
+            ranks = {f: (_rank_error(track, f, error), -f) for f, error in wrong.items()}
             self._correct(person, track, max(wrong, key=ranks.__getitem__))
-        raise InputError(f"person {person} did not come right; the annotator goes in circles")
+        raise InputError(f"person {person} has wrong boxes after {MAX_ROUNDS} corrections")
 
     def _correct(self, person: int, track: Track, frame: int) -> None:
-        """One drag: to its place; the size and the heading stay."""
+        """Drag a box to its true centre; size and heading stay."""
         true = self.truth.people[person][frame]
         if frame not in track.boxes:
             nearest = min(track.boxes, key=lambda f: abs(f - frame))
@@ -203,12 +204,13 @@ class Annotator:
         self._do("drag", do="box", track=track.id, frame=frame, box=box.tolist())
 
     def _trim(self, person: int) -> None:
-        """Let it begin and end where the person does; in between, remove boxes one by one."""
+        """Trim the track to the person's first and last frame; in between, remove extra boxes one
+        by one."""
         boxes = self.truth.people[person]
         for late in (True, False):
             track = self._track_of(person)
             extra = sorted(f for f, b in track.boxes.items() if f not in boxes
-                           and self.truth.seen(f, np.array(b.values)))
+                           and self.truth.is_labelled_place(f, np.array(b.values)))
             outside = [f for f in extra if (f > max(boxes) if late else f < min(boxes))]
             if not outside:
                 continue
@@ -216,12 +218,11 @@ class Annotator:
                      frame=max(boxes) if late else min(boxes), side="after" if late else "before")
         track = self._track_of(person)
         for f in sorted(track.boxes):
-            if f not in boxes and self.truth.seen(f, np.array(track.boxes[f].values)):
+            if f not in boxes and self.truth.is_labelled_place(f, np.array(track.boxes[f].values)):
                 self._do("key: remove", do="remove_box", track=track.id, frame=f)
 
     def _check(self) -> None:
-        """That it is true. InputError where a pedestrian is not right, or one is labelled twice or
-        where there is none."""
+        """Raise InputError if a pedestrian is wrong, missing, or labelled where there is none."""
         person_of = {track: person for person, track in self._own.items()}
         for track in self.session.state.tracks.values():
             if track.state != ACCEPTED or track.class_name != PERSON:
@@ -231,48 +232,48 @@ class Annotator:
                 values = np.array(box.values)
                 if f in boxes and not is_right(values, boxes[f]):
                     raise InputError(f"frame {f}: track {track.id} is not right")
-                if f not in boxes and self.truth.seen(f, values):
-                    raise InputError(f"frame {f}: track {track.id} labels nobody")
+                if f not in boxes and self.truth.is_labelled_place(f, values):
+                    raise InputError(f"frame {f}: there is no person at track {track.id}")
             if missing := boxes.keys() - track.boxes.keys():
                 raise InputError(f"track {track.id} has no box in frame {min(missing)}")
         if len(person_of) < len(self.truth.people):
-            raise InputError("a person has no track of its own")
+            raise InputError("a person has no track")
 
 
-def _rank(track: Track, frame: int, error: float) -> float:
-    """Which box to put right first: where there is none, the one farthest from the others, as
-    what lies between follows; then the one that is farthest off."""
+def _rank_error(track: Track, frame: int, error: float) -> float:
+    """Rank a box for correction: missing ones first, the farthest from others leading, as the
+    frames in between are interpolated; then by error."""
     return error if np.isfinite(error) else 1e6 + min(abs(frame - f) for f in track.boxes)
 
 
-def without_tracks(looks: Sequence[Look], truth: Truth) -> int:
-    """Actions where a person gets the detections of each frame by themselves: a key for each, a
-    drag for those that are not quite right, and a box by hand for each pedestrian without one."""
+def count_actions_without_tracks(surveys: Sequence[FrameSurvey], truth: Truth) -> int:
+    """Count the actions if detections are shown frame by frame, without tracks: a key for each
+    detection, a drag for each inexact one, and a box by hand for each missing pedestrian."""
     actions = 0
-    for f, look in enumerate(looks):
-        found = look.detections
-        chosen = (found.class_ids == PEDESTRIAN) & (found.scores >= REPORTED)
-        boxes = [b for b in found.boxes[chosen].astype(np.float64) if truth.seen(f, b)]
+    for f, survey in enumerate(surveys):
+        found = survey.detections
+        chosen = (found.class_ids == PEDESTRIAN) & (found.scores >= MIN_SHOWN_SCORE)
+        boxes = [b for b in found.boxes[chosen].astype(np.float64) if truth.is_labelled_place(f, b)]
         people = [b[f] for b in truth.people.values() if f in b]
-        actions += len(boxes) + _one_by_one(boxes, people)
+        actions += len(boxes) + _count_corrections(boxes, people)
     return actions
 
 
-def _one_by_one(boxes: list[Array], people: list[Array]) -> int:
-    """Drags, and boxes made by hand, until each of the people of a frame has a right box."""
+def _count_corrections(boxes: list[Array], people: list[Array]) -> int:
+    """Count drags and hand-made boxes until each person of a frame has a right box."""
     actions, free = 0, list(boxes)
     for true in people:
-        near = min(free, key=lambda b: distance(b, true), default=None)
-        if near is None or distance(near, true) > REACH:
-            actions += PLACE + ADJUST
+        nearest = min(free, key=lambda b: centre_distance(b, true), default=None)
+        if nearest is None or centre_distance(nearest, true) > SAME_TRACK_DISTANCE_M:
+            actions += PLACE_ACTIONS + ADJUST_ACTIONS
             continue
-        free = [b for b in free if b is not near]
-        actions += not is_right(near, true)
+        free = [b for b in free if b is not nearest]
+        actions += not is_right(nearest, true)
     return actions
 
 
-def totals(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Of several drives: the sums, and the shares of what labelling by hand takes."""
+def sum_results(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Sum the counts of several drives, and compute their shares of labelling by hand."""
     keys = ("people", "boxes", "looked_at", "actions", "corrections_in_full", "by_hand",
             "without_tracks")
     sums = {key: sum(int(r[key]) for r in results.values()) for key in keys}

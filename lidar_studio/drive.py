@@ -1,4 +1,4 @@
-"""A drive to be labelled: its frames, where the sensor was, and the clouds that were looked at."""
+"""A drive to label: its frames, the sensor's poses, and a cache of segmented clouds."""
 
 from __future__ import annotations
 
@@ -22,21 +22,23 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.tracking.ego import is_valid_pose
 from lidar_perception.types import InputError, PointCloud, did_you_mean
 from lidar_studio.interpolation import Motion
-from lidar_studio.journal import header
+from lidar_studio.journal import make_journal_header
 
 Array = np.ndarray[Any, Any]
-CACHE_BYTES = 200 * 10**6  # of clouds that are kept
+MAX_CACHE_BYTES = 200 * 10**6
 MAGIC = b"LPC1"
 COLORS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#cc79a7", "#0072b2", "#d55e00", "#999999",
-          "#666666")  # Okabe and Ito's, which the colour-blind can tell apart, and two greys
-SIZE = (1.0, 1.0, 1.0)     # of a new box of a class without a usual size
+          "#666666")  # colour-blind safe palette of Okabe and Ito, and two greys
+DEFAULT_SIZE_M = (1.0, 1.0, 1.0)  # new box of a class without a usual size
 
 
 @dataclass(frozen=True)
 class Scan:
-    """N points of a frame in a random order that is always the same, so that the first ones are a
-    thinned cloud: xyz (N, 3) float32, intensity (N,) uint8, ground (N,) bool, cluster_ids (N,)
-    int32, 0 none."""
+    """A segmented cloud, its points in a fixed random order: the first ones are a thinned cloud.
+
+    xyz (N, 3) float32 in metres, intensity (N,) uint8, ground (N,) bool, cluster_ids (N,) int32
+    with 0 for no cluster.
+    """
 
     xyz: Array
     intensity: Array
@@ -44,33 +46,33 @@ class Scan:
     cluster_ids: Array
 
     @property
-    def size(self) -> int:
-        """Of memory."""
+    def nbytes(self) -> int:
+        """Memory of the arrays, in bytes."""
         return sum(a.nbytes for a in (self.xyz, self.intensity, self.ground, self.cluster_ids))
 
-    def encoded(self) -> bytes:
-        """As the page reads it: LPC1, N, the columns."""
+    def encode(self) -> bytes:
+        """Return the bytes of /api/cloud: the magic LPC1, N, then the columns."""
         count = len(self.xyz)
         return b"".join((MAGIC, np.uint32(count).tobytes(), self.xyz.tobytes(),
                          self.intensity.tobytes(), self.ground.astype(np.uint8).tobytes(),
                          bytes(-2 * count % 4), self.cluster_ids.astype(np.uint32).tobytes()))
 
 
-def settings(frame: Frame) -> PipelineParams:
-    """How ground, clusters and candidates of a frame are found: as `best`, all around."""
+def make_pipeline_params(frame: Frame) -> PipelineParams:
+    """Return the `best` configuration without a field of view, at the frame's sensor height."""
     return with_values(BEST, {"view.enabled": False,
                               "ground.sensor_pose.height": frame.sensor_height})
 
 
-def scanned(frame: Frame) -> Scan:
-    """The cloud of a frame with ground and clusters. InputError where it cannot be read."""
+def segment_frame(frame: Frame) -> Scan:
+    """Load the cloud of a frame and segment it. InputError if it cannot be read."""
     cloud = frame.load()
-    found = segment_cloud(cloud, None, settings(frame))
-    return scan_of(cloud, found.ground, found.cluster_ids)
+    found = segment_cloud(cloud, None, make_pipeline_params(frame))
+    return to_scan(cloud, found.ground, found.cluster_ids)
 
 
-def scan_of(cloud: PointCloud, ground: Array, cluster_ids: Array) -> Scan:
-    """The scan of a cloud of N points with ground (N,) bool and cluster_ids (N,) int."""
+def to_scan(cloud: PointCloud, ground: Array, cluster_ids: Array) -> Scan:
+    """Make the scan of a cloud of N points with ground (N,) bool and cluster_ids (N,) int."""
     order = np.random.default_rng(0).permutation(len(cloud))
     intensity = np.zeros(len(cloud)) if cloud.intensity is None else cloud.intensity
     shown = np.nan_to_num(np.clip(intensity, 0.0, 1.0)) * 255
@@ -78,18 +80,17 @@ def scan_of(cloud: PointCloud, ground: Array, cluster_ids: Array) -> Scan:
                 cluster_ids[order].astype(np.int32))
 
 
-class Clouds:
-    """The scans of a drive, the last used ones kept, up to CACHE_BYTES. May be called from several
-    threads; a scan is made once."""
+class ScanCache:
+    """Thread-safe LRU cache of scans, of up to `limit` bytes; concurrent calls make a scan once."""
 
-    def __init__(self, make: Callable[[int], Scan], limit: int = CACHE_BYTES) -> None:
+    def __init__(self, make: Callable[[int], Scan], limit: int = MAX_CACHE_BYTES) -> None:
         self._make, self._limit, self._size = make, limit, 0
         self._kept: OrderedDict[int, Scan] = OrderedDict()
         self._making: dict[int, threading.Lock] = {}
         self._lock = threading.Lock()
 
     def __call__(self, i: int) -> Scan:
-        """The scan of frame i."""
+        """Return the scan of frame i."""
         with self._lock:
             making = self._making.setdefault(i, threading.Lock())
         with making:
@@ -100,54 +101,54 @@ class Clouds:
             scan = self._make(i)
             with self._lock:
                 self._kept[i] = scan
-                self._size += scan.size
+                self._size += scan.nbytes
                 while self._size > self._limit and len(self._kept) > 1:
                     old, dropped = self._kept.popitem(last=False)
                     self._making.pop(old, None)
-                    self._size -= dropped.size
+                    self._size -= dropped.nbytes
             return scan
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """name and layout for people; recording: of one sequence; frames in the order of time; scan:
-    makes the scan of a frame, by default with our own ground and clusters."""
+    """A recording of one sequence. scan: makes the scan of a frame, by default by segmenting it."""
 
     name: str
     recording: Recording
-    scan: Callable[[Frame], Scan] = scanned
+    scan: Callable[[Frame], Scan] = segment_frame
 
     @cached_property
     def frames(self) -> list[Frame]:
-        """In the order of time."""
+        """All frames, in order of time."""
         return list(self.recording.frames)
 
     @property
     def first(self) -> int:
-        """Number of the first frame."""
+        """Index of the first frame."""
         return 0
 
     @property
     def end(self) -> int:
-        """One more than the number of the last frame."""
+        """One past the index of the last frame."""
         return len(self.frames)
 
     @cached_property
-    def known_by(self) -> dict[str, Any]:
-        """Its journal's header: names, stamps, a digest of the first and the last cloud, "" where
-        they cannot be read, and whether there are poses."""
+    def journal_header(self) -> dict[str, Any]:
+        """Header of the drive's journal, with a digest of the first and last cloud ("" if they
+        cannot be read)."""
         try:
             clouds = b"".join(self.frames[i].load().xyz.tobytes() for i in (0, -1))
         except InputError:
             digest = ""
         else:
             digest = hashlib.sha256(clouds).hexdigest()[:16]
-        return header(self.name, [f.name for f in self.frames],
-                      [f.stamp_ns for f in self.frames], digest, self.motion.poses is not None)
+        return make_journal_header(self.name, [f.name for f in self.frames],
+                                   [f.stamp_ns for f in self.frames], digest,
+                                   self.motion.poses is not None)
 
     @cached_property
     def motion(self) -> Motion:
-        """Times, and poses where every frame has one."""
+        """Times of the frames, with poses if every frame has one."""
         stamps = np.array([frame.stamp_ns for frame in self.frames], np.int64)
         poses = [frame.pose() for frame in self.frames]
         if not poses or not all(map(is_valid_pose, poses)):
@@ -155,16 +156,20 @@ class Drive:
         return Motion.of(stamps, np.array(poses, np.float64))
 
     @cached_property
-    def clouds(self) -> Clouds:
-        """Its scans."""
-        return Clouds(lambda i: self.scan(self.frames[i]))
+    def load_scan(self) -> ScanCache:
+        """Function from the index of a frame to its scan, which is cached."""
+        return ScanCache(lambda i: self.scan(self.frames[i]))
 
 
-def one_drive(recording: Recording, sequence: str | None = None) -> Drive:
-    """The drive of a recording, or that of one of its sequences. InputError where there are
-    several, or none of that name."""
-    every = recording.frames[:]  # of a bag, without the clouds that iterating would keep
-    names = list(dict.fromkeys(frame.sequence for frame in every))
+def select_drive(recording: Recording, sequence: str | None = None) -> Drive:
+    """Return the drive of a recording, or of one of its sequences.
+
+    Raises:
+        InputError: the recording has several drives and `sequence` is None, or has none of this
+            name.
+    """
+    all_frames = recording.frames[:]  # iterating a bag would keep the clouds in memory
+    names = list(dict.fromkeys(frame.sequence for frame in all_frames))
     listed = f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}"
     if sequence is None and len(names) > 1:
         raise InputError(f"{recording.path} has {len(names)} drives; name one with --sequence: "
@@ -173,14 +178,13 @@ def one_drive(recording: Recording, sequence: str | None = None) -> Drive:
         raise InputError(f"{recording.path} has no drive {sequence}; it has {listed}"
                          + did_you_mean(sequence, names))
     chosen = names[0] if sequence is None else sequence
-    frames = [frame for frame in every if frame.sequence == chosen]
+    frames = [frame for frame in all_frames if frame.sequence == chosen]
     path = Path(recording.path).absolute()
     return Drive("_".join(filter(None, (path.name, chosen))), replace(recording, frames=frames))
 
 
 def require_clouds(drive: Drive) -> None:
-    """Raise the InputError of the first frame if neither its cloud nor the middle or last one can
-    be read."""
+    """Raise the first frame's InputError if the first, middle and last cloud are all unreadable."""
     problems: list[InputError] = []
     for i in sorted({0, len(drive.frames) // 2, len(drive.frames) - 1}):
         try:
@@ -191,9 +195,9 @@ def require_clouds(drive: Drive) -> None:
     raise problems[0]
 
 
-def classes() -> list[dict[str, Any]]:
-    """What the page offers as classes: name, usual size, colour."""
+def list_classes() -> list[dict[str, Any]]:
+    """List the classes that the page offers: name, usual size, colour."""
     named = [row for row in TABLE if row.name != "DontCare"]
     return [{"name": row.name, "color": color,
-             "size": list(row.numbers.mean_size if row.numbers else SIZE)}
+             "size": list(row.numbers.mean_size if row.numbers else DEFAULT_SIZE_M)}
             for row, color in zip(named, COLORS)]

@@ -1,7 +1,6 @@
-"""Boxes of one track from frame to frame: carried along, between, and after a correction.
+"""Boxes of one track over its frames: copying, interpolation, and propagation of corrections.
 
-All of it happens in a fixed frame where the drive has poses, else in the sensor's. Time is that of
-the stamps.
+Boxes are interpolated over stamps, in a fixed frame if the drive has poses, else in the sensor's.
 """
 
 from __future__ import annotations
@@ -22,55 +21,55 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """times (F,) float64 seconds, rising; poses (F, 4, 4) of the sensor in a fixed frame, None
-    where they are unknown."""
+    """Motion of the sensor: times (F,) float64 in seconds, increasing; poses (F, 4, 4) in a fixed
+    frame, None if unknown."""
 
     times: Array
     poses: Array | None = None
 
     @staticmethod
     def of(stamps_ns: Array, poses: Array | None = None) -> Motion:
-        """From stamps (F,) int; frames that do not follow each other in time count as 0.1 s."""
+        """Make it from stamps (F,) int; if they do not increase, frames are 0.1 s apart."""
         times = (stamps_ns - stamps_ns[0]) / 1e9 if len(stamps_ns) else np.zeros(0)
         if (np.diff(times) <= 0).any():
             times = np.arange(len(times)) * 0.1
         return Motion(times, poses)
 
-    def fixed(self, values: Array | tuple[float, ...], frame: int) -> Array:
-        """(7,) a box of a frame in the fixed frame."""
+    def to_fixed(self, values: Array | tuple[float, ...], frame: int) -> Array:
+        """Transform a box (7,) from the sensor at `frame` to the fixed frame."""
         box = np.asarray(values, np.float64)
         return box if self.poses is None else transform_boxes(box, self.poses[frame])[0]
 
-    def seen(self, box: Array, frame: int) -> Array:
-        """The inverse of fixed."""
+    def to_sensor(self, box: Array, frame: int) -> Array:
+        """Transform a box (7,) from the fixed frame to the sensor at `frame`."""
         return box if self.poses is None else transform_boxes(
             box, invert_pose(self.poses[frame]))[0]
 
-    def carried(self, values: Array | tuple[float, ...], frm: int, to: int) -> Array:
-        """(7,) a box of one frame as it is in another if it stands."""
-        return self.seen(self.fixed(values, frm), to)
+    def carry_box(self, values: Array | tuple[float, ...], frm: int, to: int) -> Array:
+        """Return a box (7,) of one frame as seen in another, if the object stands still."""
+        return self.to_sensor(self.to_fixed(values, frm), to)
 
 
-def between(first: Array, last: Array, share: float) -> Array:
-    """(7,) a box on the way from one to another, both (7,), the yaw by the shorter turn."""
+def interpolate_box(first: Array, last: Array, share: float) -> Array:
+    """Interpolate two boxes (7,) linearly, the yaw over the shorter turn."""
     box = first + share * (last - first)
     box[6] = wrap_angle(first[6] + share * wrap_angle(last[6] - first[6]))
     return box
 
 
-def corrected(boxes: Mapping[int, Box], gone: frozenset[int], frame: int,
-              values: tuple[float, ...], motion: Motion) -> dict[int, Box]:
-    """The boxes of a track after a person set the one of a frame.
+def apply_correction(boxes: Mapping[int, Box], gone: frozenset[int], frame: int,
+                     values: tuple[float, ...], motion: Motion) -> dict[int, Box]:
+    """Return the boxes of a track after a person set the box of a frame, now a key box.
 
-    It is a key box from now on. Up to the next key box on either side the boxes follow: by the
-    whole correction where it is set, by none of it at the other key box, in between by its share of
-    the time; frames without a box get one on the straight way. Beyond the outermost key box they
-    take the whole correction, and the size. Key boxes stay, and frames in gone stay empty.
+    Up to the next key box on each side, boxes move by a share of the correction that falls
+    linearly with time to zero at that key box, and frames without a box get an interpolated one.
+    Beyond the outermost key box, boxes take the whole correction and the new size. Other key boxes
+    do not move, and frames in `gone` stay empty.
     """
     found = dict(boxes)
     found[frame] = Box(values, KEY)
-    new = motion.fixed(values, frame)
-    old = _estimated(boxes, frame, motion)
+    new = motion.to_fixed(values, frame)
+    old = _estimate_box(boxes, frame, motion)
     change = np.zeros(7) if old is None else new - old
     change[6] = wrap_angle(change[6])
     for step in (-1, 1):
@@ -79,80 +78,84 @@ def corrected(boxes: Mapping[int, Box], gone: frozenset[int], frame: int,
                    default=None)
         if stop is None:
             for f in side:
-                moved = motion.fixed(boxes[f].values, f) + change
+                moved = motion.to_fixed(boxes[f].values, f) + change
                 moved[3:6], moved[6] = new[3:6], wrap_angle(moved[6])
-                found[f] = Box.of(motion.seen(moved, f), boxes[f].kind)
+                found[f] = Box.of(motion.to_sensor(moved, f), boxes[f].kind)
             if side and (near := min(side, key=lambda f: abs(f - frame))) != frame + step:
-                _fill(found, gone, near, frame, motion)
+                _fill_gap(found, gone, near, frame, motion)
         else:
-            _ramp(found, stop, frame, new, change, motion)
-            _fill(found, gone, stop, frame, motion)
+            _distribute_correction(found, stop, frame, new, change, motion)
+            _fill_gap(found, gone, stop, frame, motion)
     return found
 
 
-def _estimated(boxes: Mapping[int, Box], frame: int, motion: Motion) -> Array | None:
-    """(7,) where the track is in a frame, in the fixed one; None before its begin and after its
-    end."""
+def _estimate_box(boxes: Mapping[int, Box], frame: int, motion: Motion) -> Array | None:
+    """Return the box (7,) of a frame in the fixed frame, interpolated if missing; None before the
+    first and after the last box."""
     if frame in boxes:
-        return motion.fixed(boxes[frame].values, frame)
+        return motion.to_fixed(boxes[frame].values, frame)
     before = max((f for f in boxes if f < frame), default=None)
     after = min((f for f in boxes if f > frame), default=None)
     if before is None or after is None:
         return None
-    return _on_the_way(boxes, before, after, frame, motion)
+    return _interpolate_between(boxes, before, after, frame, motion)
 
 
-def _on_the_way(boxes: Mapping[int, Box], a: int, b: int, frame: int, motion: Motion) -> Array:
+def _interpolate_between(boxes: Mapping[int, Box], a: int, b: int, frame: int,
+                         motion: Motion) -> Array:
     share = float((motion.times[frame] - motion.times[a]) / (motion.times[b] - motion.times[a]))
-    return between(motion.fixed(boxes[a].values, a), motion.fixed(boxes[b].values, b), share)
+    first, last = (motion.to_fixed(boxes[f].values, f) for f in (a, b))
+    return interpolate_box(first, last, share)
 
 
-def _ramp(found: dict[int, Box], stop: int, frame: int, new: Array, change: Array,
-          motion: Motion) -> None:
-    """Move the boxes between the key boxes of stop and frame by their shares of a change; a
-    heading comes to the side of those of the key boxes."""
-    fixed = motion.fixed(found[stop].values, stop)
+def _distribute_correction(found: dict[int, Box], stop: int, frame: int, new: Array, change: Array,
+                           motion: Motion) -> None:
+    """Move the boxes between the key boxes of `stop` and `frame` by their shares of a change; flip
+    headings that oppose those of the key boxes."""
+    fixed = motion.to_fixed(found[stop].values, stop)
     turn = wrap_line(change[6])
     for f in [f for f in found if min(stop, frame) < f < max(stop, frame)]:
         share = float((motion.times[f] - motion.times[stop])
                       / (motion.times[frame] - motion.times[stop]))
-        straight, moved = between(fixed, new, share), motion.fixed(found[f].values, f)
+        straight, moved = interpolate_box(fixed, new, share), motion.to_fixed(found[f].values, f)
         moved[:3] += share * change[:3]
         moved[3:6] = straight[3:6]
         moved[6] += share * turn
         if abs(wrap_angle(moved[6] - straight[6])) > np.pi / 2:
             moved[6] += np.pi
         moved[6] = wrap_angle(moved[6])
-        found[f] = Box.of(motion.seen(moved, f), INTERPOLATED)
+        found[f] = Box.of(motion.to_sensor(moved, f), INTERPOLATED)
 
 
-def _fill(found: dict[int, Box], gone: frozenset[int], a: int, b: int, motion: Motion) -> None:
-    """Give frames between a and b that have no box one on the way between their neighbours."""
-    there = sorted(f for f in found if min(a, b) <= f <= max(a, b))
-    for first, last in pairwise(there):
+def _fill_gap(found: dict[int, Box], gone: frozenset[int], a: int, b: int, motion: Motion) -> None:
+    """Interpolate a box for every frame between a and b that has none and is not in `gone`."""
+    frames = sorted(f for f in found if min(a, b) <= f <= max(a, b))
+    for first, last in pairwise(frames):
         for f in range(first + 1, last):
             if f not in gone:
-                found[f] = Box.of(motion.seen(_on_the_way(found, first, last, f, motion), f),
-                                  INTERPOLATED)
+                box = _interpolate_between(found, first, last, f, motion)
+                found[f] = Box.of(motion.to_sensor(box, f), INTERPOLATED)
 
 
-def straightened(boxes: Mapping[int, Box], gone: frozenset[int], frame: int,
-                 motion: Motion) -> dict[int, Box] | None:
-    """The boxes of a track with that of a frame given back: all between the key boxes on either
-    side of it are on the straight way, except in frames in gone. None where there are no two."""
+def reinterpolate_frame(boxes: Mapping[int, Box], gone: frozenset[int], frame: int,
+                        motion: Motion) -> dict[int, Box] | None:
+    """Interpolate the boxes between the key boxes around `frame`, except in frames in `gone`.
+
+    Return None if there is no key box on one of the sides.
+    """
     keys = [f for f, box in boxes.items() if box.kind == KEY and f != frame]
     before = max((f for f in keys if f < frame), default=None)
     after = min((f for f in keys if f > frame), default=None)
     if before is None or after is None:
         return None
     found = {f: box for f, box in boxes.items() if not before < f < after}
-    _fill(found, gone, before, after, motion)
+    _fill_gap(found, gone, before, after, motion)
     return dict(sorted(found.items()))
 
 
-def filled(boxes: Mapping[int, Box], motion: Motion) -> dict[int, Box]:
-    """Proposed boxes with those of the frames between them that have none."""
+def fill_gaps(boxes: Mapping[int, Box], motion: Motion) -> dict[int, Box]:
+    """Return proposed boxes, with the gaps between them interpolated."""
     found = dict(boxes)
     if found:
-        _fill(found, frozenset(), min(found), max(found), motion)
-    return {f: b if f in boxes else Box(b.values, PROPOSED) for f, b in found.items()}
+        _fill_gap(found, frozenset(), min(found), max(found), motion)
+    return {f: b if f in boxes else Box(b.values, PROPOSED) for f, b in sorted(found.items())}

@@ -1,7 +1,7 @@
-"""Every action in a file, before it counts: a kill loses nothing but a line that was half written.
+"""Journal file of a labelling session: every action is on disk before it takes effect.
 
-The first line says of which drive it is; each further line is an action, with its number. Lines are
-appended and brought to the disk one by one.
+A killed process loses at most a half-written last line. The first line identifies the drive; each
+further line is one action with its number.
 """
 
 from __future__ import annotations
@@ -17,58 +17,62 @@ from typing import Any
 from lidar_perception.runs.resuming import find_differences, lock_file, lock_folder
 from lidar_perception.types import InputError
 
-NAME, VERSION = "journal.jsonl", 1
+JOURNAL_NAME, VERSION = "journal.jsonl", 1
 
 
-def header(drive: str, names: Sequence[str], stamps_ns: Sequence[int],
-           clouds: str = "", posed: bool | None = None) -> dict[str, Any]:
-    """What a journal says of its drive: one of other frames is another. clouds: a digest of some;
-    where it is the same, the folder of the drive may have any name. posed: whether the drive knows
-    where the sensor was."""
+def make_journal_header(drive: str, names: Sequence[str], stamps_ns: Sequence[int],
+                        clouds: str = "", posed: bool | None = None) -> dict[str, Any]:
+    """Make the first line of a journal, which identifies the drive by its frames.
+
+    Args:
+        drive: name of the drive; it may differ if `clouds` is the same.
+        clouds: digest of some of the clouds, "" if unknown.
+        posed: True if the drive has poses of the sensor.
+    """
     stamps = hashlib.sha256(" ".join(map(str, stamps_ns)).encode()).hexdigest()[:16]
     return {"journal": VERSION, "drive": drive, "frames": len(names),
             "first": names[0] if names else "", "last": names[-1] if names else "",
             "stamps_sha": stamps, "clouds": clouds, "posed": posed}
 
 
-def _encoded(line: Mapping[str, Any]) -> bytes:
+def _encode(line: Mapping[str, Any]) -> bytes:
     return (json.dumps(line, allow_nan=False, separators=(",", ":")) + "\n").encode()
 
 
 class Journal:
-    """The journal of a folder. lines: the actions that were in it when it was opened; message: what
-    had to be mended, or None."""
+    """The journal of a folder. lines: its actions when it was opened; message: a warning about the
+    file, or None."""
 
     def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
-        self.path = folder / NAME
+        self.path = folder / JOURNAL_NAME
         self.message: str | None = None
-        self._head = dict(head)
+        self._header = dict(head)
         self.lines: list[dict[str, Any]] = []
         try:
             self._file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
             raise InputError(f"cannot open {self.path}: {error.strerror}") from None
         try:
-            if why := lock_file(self._file, self.path):  # on NFS the lock of its folder is none
-                self.message = (f"{self.path} cannot be locked ({why}): let no second process "
-                                "label this drive")
-            self._size = self._read()
+            if why := lock_file(self._file, self.path):  # the folder's lock has no effect on NFS
+                self.message = (f"{self.path} cannot be locked ({why}): do not label this drive "
+                                "from a second process")
+            self._size = self._read_lines()
             if self._size == 0:
-                self.append(self._head)
+                self.append(self._header)
                 _sync_folder(folder)
         except BaseException:
             self.close()
             raise
 
     def append(self, line: Mapping[str, Any]) -> None:
-        """Write a line, to the disk. InputError where that cannot be; the file is as it was."""
-        content, there = _encoded(line), os.fstat(self._file)
-        if there.st_nlink == 0:  # what is written would be gone with this process
-            raise InputError(f"{self.path} was removed or replaced; nothing was done: export what "
-                             "there is, and start again")
-        if there.st_size != self._size:  # on a file system without locks
-            raise InputError(f"another process has written {self.path}; nothing was done: end one "
-                             "of them, and start again")
+        """Write a line and sync it to disk. InputError if that fails; the file is unchanged."""
+        content, status = _encode(line), os.fstat(self._file)
+        if status.st_nlink == 0:  # the data would be lost when this process ends
+            raise InputError(f"{self.path} was removed or replaced; nothing was done: export your "
+                             "labels and start again")
+        if status.st_size != self._size:  # on a file system without locks
+            raise InputError(f"another process has written {self.path}; nothing was done: stop one "
+                             "of them and start again")
         try:
             view = memoryview(content)
             while view:
@@ -78,31 +82,31 @@ class Journal:
         except OSError as error:
             with suppress(OSError):
                 os.ftruncate(self._file, self._size)
-            raise InputError(f"cannot write {self.path}: {error.strerror}; nothing was done, make "
-                             "room and do it again") from None
+            raise InputError(f"cannot write {self.path}: {error.strerror}; nothing was done: free "
+                             "disk space and try again") from None
         self._size += len(content)
 
     def close(self) -> None:
-        """No more lines."""
+        """Close the file."""
         with suppress(OSError):
             os.close(self._file)
 
-    def _read(self) -> int:
-        """Take the lines, and cut off one that was not written to its end; the size that is left.
-        InputError for a journal of another drive, or one that is broken within."""
+    def _read_lines(self) -> int:
+        """Read all lines, truncate an incomplete last one, and return the size of the file.
+        InputError for the journal of another drive or a damaged one."""
         with open(self.path, "rb") as stream:
             content = stream.read()
         whole = content.rfind(b"\n") + 1
         lines = content[:whole].splitlines()
-        found = [self._parsed(text, number) for number, text in enumerate(lines, 1)]
+        found = [self._parse_line(text, number) for number, text in enumerate(lines, 1)]
         if found:
-            self._check(found[0])
-        elif content and not _encoded(self._head).startswith(content):
-            raise InputError(f"{self.path} is no journal of labels; move it away")
+            self._check_header(found[0])
+        elif content and not _encode(self._header).startswith(content):
+            raise InputError(f"{self.path} is not a journal of labels; move it away")
         if whole < len(content):
             os.ftruncate(self._file, whole)
             os.fsync(self._file)
-            self.message = (f"the last line of {self.path} was not written to its end, so "
+            self.message = (f"the last line of {self.path} was incomplete, so its "
                             f"{len(content) - whole} bytes were cut off; one action may be lost")
         self.lines = found[1:]
         for number, line in enumerate(self.lines, 1):
@@ -111,35 +115,35 @@ class Journal:
                                  f"{number}; the file was changed by something else")
         return whole
 
-    def _parsed(self, text: bytes, number: int) -> dict[str, Any]:
+    def _parse_line(self, text: bytes, number: int) -> dict[str, Any]:
         try:
             line = json.loads(text)
             if not isinstance(line, dict):
-                raise ValueError("it is no object")
+                raise ValueError("not a JSON object")
             return line
         except (ValueError, RecursionError) as error:
-            raise InputError(f"{self.path}:{number} is no line of a journal ({error}); restore the "
-                             "file or move it away") from None
+            raise InputError(f"{self.path}:{number} is not a line of a journal ({error}); restore "
+                             "the file or move it away") from None
 
-    def _check(self, found: Mapping[str, Any]) -> None:
-        asked = dict(self._head)
-        if not found.get("clouds") or not asked["clouds"]:  # a journal of before, or broken clouds
-            asked.pop("clouds")
-        elif found["clouds"] == asked["clouds"]:
-            asked.pop("drive")
-        posed = asked.pop("posed", None), found.get("posed")  # the latter None: of before
+    def _check_header(self, found: Mapping[str, Any]) -> None:
+        expected = dict(self._header)
+        if not found.get("clouds") or not expected["clouds"]:  # an old journal, or broken clouds
+            expected.pop("clouds")
+        elif found["clouds"] == expected["clouds"]:
+            expected.pop("drive")
+        posed = expected.pop("posed", None), found.get("posed")  # None in an old journal
         if set(posed) == {True, False}:
-            now, then = ("with" if each else "without" for each in posed)
-            raise InputError(f"{self.path} was made {then} poses of the sensor, and the drive is "
-                             f"{now} them now, by which boxes between those set by hand would be "
-                             "others; give the drive as it was, or another --out")
-        if different := find_differences({k: found.get(k) for k in asked}, asked):
+            now, then = ("with" if value else "without" for value in posed)
+            raise InputError(f"{self.path} was made {then} poses of the sensor, but the drive is "
+                             f"{now} them now, which would change all interpolated boxes; give the "
+                             "drive as it was, or another --out")
+        if different := find_differences({k: found.get(k) for k in expected}, expected):
             raise InputError(f"{self.path} is the journal of another drive: "
                              f"{'; '.join(different)}; give another --out")
 
 
 def _sync_folder(folder: Path) -> None:
-    """So that a new file's name is on the disk too."""
+    """Sync the folder, so that the name of a new file is on disk too."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -148,9 +152,9 @@ def _sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def opened(folder: Path, head: Mapping[str, Any]) -> Iterator[Journal]:
-    """The journal of a folder, which is made if need be. InputError while another process has
-    it."""
+def open_journal(folder: Path, head: Mapping[str, Any]) -> Iterator[Journal]:
+    """Open the journal of a folder; make both if they do not exist. InputError while another
+    process has the folder."""
     with lock_folder(folder):
         journal = Journal(folder, head)
         try:

@@ -1,5 +1,5 @@
-"""Which topics of a running graph are looked at: the clouds that say most, and the boxes that go
-with them."""
+"""Selection of the topics of a running graph to show: the clouds with the most columns, and the
+boxes that belong to them."""
 
 from __future__ import annotations
 
@@ -10,58 +10,66 @@ from lidar_perception.types import InputError
 from lidar_perception.wire.clouds import POINT_CLOUD
 from lidar_perception.wire.topics import FOUND, POINTS, TRUTH
 from lidar_perception.wire.topics import TRACKS as TRACKED
-from lidar_studio.live import BOXES, LABELS, TRACKS
-from lidar_studio.results import CLUSTERED
+from lidar_studio.live_graph import BOXES, LABELS, TRACKS
+from lidar_studio.results import CLUSTERED_TOPICS
 
 ARRAY = "vision_msgs/msg/Detection3DArray"
-# The ends of topics of clouds, those with the most columns first.
-CLOUDS = tuple(topic.lstrip("/") for topic in (
-    *CLUSTERED, "/ground_segmentation/output/points", POINTS))
-ENDS = {FOUND: BOXES, TRACKED: TRACKS, TRUTH: LABELS}
-TWIN = "_3d"  # what a topic of markers is called as a Detection3DArray
+# Endings of cloud topics, those with the most columns first.
+CLOUD_ENDINGS = tuple(topic.lstrip("/") for topic in (
+    *CLUSTERED_TOPICS, "/ground_segmentation/output/points", POINTS))
+KIND_BY_ENDING = {FOUND: BOXES, TRACKED: TRACKS, TRUTH: LABELS}
+ARRAY_SUFFIX = "_3d"  # of a topic of markers that is also published as Detection3DArray
 
 
-def namespace_of(topic: str) -> str:
-    """Where the node of a topic is, by its name: NS of /NS/NODE/output/NAME and of
-    /NS/ground_truth/detections, of others what is before the last slash; "" is the root."""
-    parts = topic.removesuffix(TWIN).strip("/").split("/")
+def parse_namespace(topic: str) -> str:
+    """Return the namespace of the node that publishes a topic, by the topic's name.
+
+    NS for /NS/NODE/output/NAME and /NS/ground_truth/detections, else everything before the last
+    slash; "" is the root.
+    """
+    parts = topic.removesuffix(ARRAY_SUFFIX).strip("/").split("/")
     own = 3 if parts[-2:-1] == ["output"] else 2 if parts[-2:] == TRUTH.strip("/").split("/") else 1
     return "/".join(parts[:-own])
 
 
-def in_namespace(topic: str, namespace: str) -> bool:
-    """Whether a topic is of a node in a namespace: "" for all, "/" for the root alone, else with
-    those inside it."""
+def is_in_namespace(topic: str, namespace: str) -> bool:
+    """Return True if the node of a topic is in a namespace or below it; "" is every namespace, "/"
+    only the root."""
     inside = namespace.strip("/")
     if inside:
         return topic.startswith(f"/{inside}/")
-    return not namespace or not namespace_of(topic)
+    return not namespace or not parse_namespace(topic)
 
 
-def resolved(topic: str, namespace: str) -> str:
-    """The whole name of a topic that was given as it is, or relative to the namespace."""
+def resolve_topic(topic: str, namespace: str) -> str:
+    """Return the full name of a topic that may be relative to the namespace."""
     parts = [] if topic.startswith("/") else [namespace.strip("/")]
     return "/" + "/".join(filter(None, (*parts, topic.strip("/"))))
 
 
-def clouds_topic(types: Mapping[str, str], namespace: str = "", wanted: str = "") -> str:
-    """The topic of the clouds, of topic -> type of all that is published: the wanted one; else the
-    one with most columns, else the only one. InputError, in a line for a person, where there is
-    none, or it is not clear which."""
+def select_cloud_topic(types: Mapping[str, str], namespace: str = "", wanted: str = "") -> str:
+    """Select the cloud topic: `wanted`, else the one with the most columns, else the only one.
+
+    Args:
+        types: type of each published topic.
+
+    Raises:
+        InputError: there is no such topic, or several are equally good.
+    """
     clouds = sorted(t for t, kind in types.items() if kind == POINT_CLOUD)
     where = f" in the namespace {namespace}" if namespace else ""
     if wanted:
-        full = resolved(wanted, namespace)
+        full = resolve_topic(wanted, namespace)
         if full not in clouds:
             raise InputError(f"nobody publishes clouds on {full}; there are clouds on "
                              f"{', '.join(clouds) or 'no topic'}")
         return full
-    inside = [t for t in clouds if in_namespace(t, namespace)]
+    inside = [t for t in clouds if is_in_namespace(t, namespace)]
     if not inside:
         raise InputError(f"nobody publishes clouds{where}; is the graph running, on this "
                          "ROS_DOMAIN_ID?" + (f" There are clouds on {', '.join(clouds)}"
                                              if clouds else ""))
-    for end in CLOUDS:
+    for end in CLOUD_ENDINGS:
         if found := [t for t in inside if t.endswith(f"/{end}") or t.endswith(f"_{end}")]:
             inside = found
             break
@@ -71,39 +79,47 @@ def clouds_topic(types: Mapping[str, str], namespace: str = "", wanted: str = ""
     return inside[0]
 
 
-def box_topics(types: Mapping[str, str], clouds: str, namespace: str = "",
-               wanted: Iterable[str] = ()) -> dict[str, str]:
-    """Topic -> kind (BOXES, TRACKS, LABELS) of what goes with the clouds of a topic, see _home().
-    wanted: the topics of detections, instead of all that there are. An array that is there as
-    markers too is left out."""
+def select_box_topics(types: Mapping[str, str], clouds: str, namespace: str = "",
+                      wanted: Iterable[str] = ()) -> dict[str, str]:
+    """Select the box topics that belong to a cloud topic, with their kind: BOXES, TRACKS or LABELS.
+
+    A Detection3DArray that is also published as markers is left out.
+
+    Args:
+        types: type of each published topic.
+        wanted: topics of detections, empty for all.
+    """
     found = {}
     for topic, kind in types.items():
         if kind not in (MARKERS, ARRAY):
             continue
-        plain = topic.removesuffix(TWIN) if kind == ARRAY else topic
+        plain = topic.removesuffix(ARRAY_SUFFIX) if kind == ARRAY else topic
         if kind == ARRAY and types.get(plain) == MARKERS:
             continue
-        for ending, what in ENDS.items():
+        for ending, box_kind in KIND_BY_ENDING.items():
             if plain.endswith(ending):
-                found[topic] = what
-    home = namespace or _home(clouds, found)
-    found = {t: k for t, k in found.items() if in_namespace(t, home)}
-    asked = [resolved(t, namespace) for t in wanted]
-    if asked:
+                found[topic] = box_kind
+    home = namespace or _infer_namespace(clouds, found)
+    found = {t: k for t, k in found.items() if is_in_namespace(t, home)}
+    requested = [resolve_topic(t, namespace) for t in wanted]
+    if requested:
         found = {t: k for t, k in found.items() if k != BOXES}
-        found |= {t: BOXES for t in asked if types.get(t) in (MARKERS, ARRAY)}
+        found |= {t: BOXES for t in requested if types.get(t) in (MARKERS, ARRAY)}
     return found
 
 
-def _home(clouds: str, found: Mapping[str, str]) -> str:
-    """The namespace, for in_namespace(), of what goes with clouds, where none was given: of a
-    node's clouds that of the node. A driver's may be named after the sensor, as /ouster/points, so
-    with them goes the nearest one above that has boxes; and all there is where that is of one
-    robot, except with NS/points, which may be of another."""
-    own = namespace_of(clouds)
+def _infer_namespace(clouds: str, found: Mapping[str, str]) -> str:
+    """Infer the namespace of the boxes that belong to clouds, as for is_in_namespace().
+
+    For clouds of one of our nodes it is the node's namespace. A driver's topic may be named after
+    the sensor, such as /ouster/points, so the nearest parent namespace with boxes is used. If all
+    boxes belong to one robot, they are all shown, except with NS/points, which may belong to
+    another robot.
+    """
+    own = parse_namespace(clouds)
     if "/output/" in clouds:
         return own or "/"
-    homes = {namespace_of(topic) for topic, kind in found.items() if kind != LABELS}
+    homes = {parse_namespace(topic) for topic, kind in found.items() if kind != LABELS}
     above = [home for home in homes if not home or clouds.startswith(f"/{home}/")]
     one_robot = len(homes) < 2 and (above or not own or not clouds.endswith(POINTS))
     return "" if one_robot else max(above, key=len, default=own) or "/"

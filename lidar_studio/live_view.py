@@ -1,4 +1,4 @@
-"""The node behind the page of `view --live`: listens to a running graph, hands on what comes."""
+"""The node of `view --live`: subscribes to a running graph and passes its messages to the page."""
 
 from __future__ import annotations
 
@@ -20,124 +20,128 @@ from lidar_perception.runs.files import shorten_error
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import TF, TF_STATIC
 from lidar_perception.wire.transforms import TF_MESSAGE, add_transforms
-from lidar_studio.live import Live
-from lidar_studio.live_topics import box_topics, clouds_topic
+from lidar_studio.live_graph import LiveGraph
+from lidar_studio.live_topics import select_box_topics, select_cloud_topic
 from msg_utils.detections import from_detection_array
 from msg_utils.markers import from_marker_array
 from msg_utils.messages import load_message_class
 
-LOOK = 1.0    # seconds between looks at what there is
-ENDING = 5.0  # seconds for the message in hand
-RECEIVED = ReceptionParams(queue=5)
-SAID = "publishers", "silent", "stale", "lost", "dropped"  # of what a Reception finds wrong
+SCAN_PERIOD_S = 1.0   # between looks at the list of topics
+STOP_TIMEOUT_S = 5.0  # for the message that is being handled
+RECEPTION = ReceptionParams(queue=5)
+SHOWN_PROBLEMS = "publishers", "silent", "stale", "lost", "dropped"  # kinds of Reception.problems
 
 
 class LiveView(ExternalNode):
-    """Listens from its making on, while run() is called. clouds, boxes: topics that are wanted; ""
-    and none: those that live_topics finds."""
+    """Subscribes to the topics of a graph while run() is running.
 
-    def __init__(self, live: Live, domain: int | None = None, namespace: str = "",
+    Args:
+        clouds: topic of clouds, "" for the one that live_topics selects.
+        boxes: topics of detections, empty for those that live_topics selects.
+    """
+
+    def __init__(self, live: LiveGraph, domain: int | None = None, namespace: str = "",
                  clouds: str = "", boxes: Sequence[str] = ()) -> None:
         super().__init__(domain, f"view_{os.getpid()}")
         self.live, self.namespace, self.wanted = live, namespace, (clouds, tuple(boxes))
         self.receptions: dict[str, Reception] = {}
-        self.broken: dict[str, str] = {}  # topic -> what was wrong with its last message
-        self.clouds, self.problem, self._looked = "", "", -math.inf
+        self.decode_errors: dict[str, str] = {}  # by topic, of its last message
+        self.clouds, self.problem, self._last_scan = "", "", -math.inf
         if has_tf():
             for topic, qos in ((TF, TF_QOS), (TF_STATIC, STATIC_QOS)):
                 self.node.create_subscription(
-                    load_message_class(TF_MESSAGE), topic, self._taking(
+                    load_message_class(TF_MESSAGE), topic, self._make_handler(
                         topic, TF_MESSAGE, partial(add_transforms, live.tree,
                                                    static=topic == TF_STATIC)), qos, raw=True)
 
     def run(self, stop: threading.Event) -> None:
-        """Listen until it is told to stop; what goes wrong in that is said on the page."""
+        """Spin until `stop` is set; an exception is also shown on the page."""
         try:
-            self.spin_until(stop.is_set, math.inf, self._each)
-        except Exception as error:  # of a thread nobody waits for
-            self.live.lines = [f"nothing is received any more: {type(error).__name__}: "
-                               f"{shorten_error(error)}; start again"]
-            self.live.tick()
+            self.spin_until(stop.is_set, math.inf, self._step)
+        except Exception as error:  # nobody joins this thread
+            self.live.lines = [f"reception has stopped: {type(error).__name__}: "
+                               f"{shorten_error(error)}; start view again"]
+            self.live.update()
             raise
 
-    def _each(self) -> None:
-        if monotonic() - self._looked >= LOOK:
-            self._looked = monotonic()
-            self.look()
-        self.live.tick()
+    def _step(self) -> None:
+        if monotonic() - self._last_scan >= SCAN_PERIOD_S:
+            self._last_scan = monotonic()
+            self.update_topics()
+        self.live.update()
 
-    def look(self) -> None:
-        """See what is published, and listen to what is wanted of it. Clouds that are not published
-        for the moment are waited for, until there are others."""
+    def update_topics(self) -> None:
+        """Subscribe to the topics to show and unsubscribe from others. A cloud topic without
+        publishers is kept until there is another one."""
         types = {topic: kinds[0] for topic, kinds in self.node.get_topic_names_and_types()
                  if len(kinds) == 1 and self.node.count_publishers(topic)}
         self.problem = ""
         try:
-            chosen = clouds_topic(types, self.namespace, self.wanted[0])
+            chosen = select_cloud_topic(types, self.namespace, self.wanted[0])
         except InputError as error:
             chosen, self.problem = self.clouds, str(error)
         if chosen != self.clouds:
             self._forget([self.clouds] if self.clouds else [])
             self.clouds = chosen
-            self._open(chosen, CLOUD, lambda m: self.live.cloud(m))
-        found = box_topics(types, chosen, self.namespace, self.wanted[1]) if chosen else {}
+            self._subscribe(chosen, CLOUD, lambda m: self.live.add_cloud(m))
+        found = select_box_topics(types, chosen, self.namespace, self.wanted[1]) if chosen else {}
         for topic in found.keys() - self.receptions.keys():
-            self.live.hear(topic, found[topic])
-            self._open(topic, types[topic], self._boxes(topic, types[topic]))
+            self.live.expect_topic(topic, found[topic])
+            self._subscribe(topic, types[topic], self._make_box_handler(topic, types[topic]))
         self._forget(self.receptions.keys() - found.keys() - {self.clouds})
         for reception in self.receptions.values():
             reception.adapt()
-        self._say()
+        self._update_status()
 
     def _forget(self, topics: Iterable[str]) -> None:
         for topic in list(topics):
             self.receptions.pop(topic).close()
-            self.broken.pop(topic, None)
-            self.live.forget(topic)
+            self.decode_errors.pop(topic, None)
+            self.live.forget_topic(topic)
 
-    def _open(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
-        taking = self._taking(topic, kind, take)
+    def _subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
+        handle = self._make_handler(topic, kind, take)
         reception = self.receptions[topic] = Reception(
-            self.node, load_message_class(kind), topic, lambda data, patient: taking(data),
-            lambda: RECEIVED, "cloud" if kind == CLOUD else "array")
+            self.node, load_message_class(kind), topic, lambda data, patient: handle(data),
+            lambda: RECEPTION, "cloud" if kind == CLOUD else "array")
         reception.open()
 
-    def _taking(self, topic: str, kind: str,
-                take: Callable[[Any], None]) -> Callable[[bytes], None]:
-        def taking(data: bytes) -> None:
+    def _make_handler(self, topic: str, kind: str,
+                      take: Callable[[Any], None]) -> Callable[[bytes], None]:
+        def handle(data: bytes) -> None:
             try:
                 take(decode_message(data, kind))
-                self.broken.pop(topic, None)
-            except Exception as error:  # of whatever anybody sends: it is said, and the next taken
-                self.broken[topic] = f"{topic}: {shorten_error(error)}"
-        return taking
+                self.decode_errors.pop(topic, None)
+            except Exception as error:  # any node may send an invalid message
+                self.decode_errors[topic] = f"{topic}: {shorten_error(error)}"
+        return handle
 
-    def _boxes(self, topic: str, kind: str) -> Callable[[Any], None]:
+    def _make_box_handler(self, topic: str, kind: str) -> Callable[[Any], None]:
         if kind == MARKERS:
-            return lambda m: self.live.boxes(topic, from_marker_array(m), m)
-        return lambda m: self.live.boxes(topic, from_detection_array(m), None)
+            return lambda m: self.live.add_boxes(topic, from_marker_array(m), m)
+        return lambda m: self.live.add_boxes(topic, from_detection_array(m), None)
 
-    def _say(self) -> None:
+    def _update_status(self) -> None:
         clouds = self.receptions.get(self.clouds)
         lines = [self.problem] if self.problem else []
         if clouds is not None:
             self.live.values = {"topic": self.clouds, **clouds.values()}
             if not self.problem:
-                lines += [text for kind, _, text in clouds.problems() if kind in SAID]
+                lines += [text for kind, _, text in clouds.problems() if kind in SHOWN_PROBLEMS]
                 if clouds.last_time is None:
-                    lines.append(f"no cloud has come on {self.clouds} yet")
+                    lines.append(f"no cloud received on {self.clouds} yet")
         for topic, reception in self.receptions.items():
             lost = reception.arrivals.lost + reception.arrivals.dropped
             if topic != self.clouds and lost:
                 lines.append(f"{lost} of {reception.arrivals.sent} arrays on {topic} were lost")
-        if any(heard.elsewhere for heard in self.live.topics.values()) and not has_tf():
+        if any(box_topic.tf_problem for box_topic in self.live.topics.values()) and not has_tf():
             lines.append(NO_TF)
-        self.live.lines = [*lines, *self.broken.values()]
+        self.live.lines = [*lines, *self.decode_errors.values()]
 
 
 @contextmanager
-def listening(live: Live, *arguments: Any) -> Iterator[None]:
-    """A LiveView in a thread of its own, for as long as the block lasts; takes its arguments."""
+def run_live_view(live: LiveGraph, *arguments: Any) -> Iterator[None]:
+    """Run a LiveView, made with these arguments, in a thread while the context is open."""
     with LiveView(live, *arguments) as view:
         stop = threading.Event()
         thread = threading.Thread(target=view.run, args=(stop,), daemon=True)
@@ -146,4 +150,4 @@ def listening(live: Live, *arguments: Any) -> Iterator[None]:
             yield
         finally:
             stop.set()
-            thread.join(ENDING)
+            thread.join(STOP_TIMEOUT_S)

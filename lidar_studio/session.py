@@ -1,5 +1,7 @@
-"""A drive with its labels, and all that can be done to them: the server and the simulated annotator
-both work through this."""
+"""A labelling session: the labels of a drive and everything that can be done to them.
+
+Used by the server and by the simulated annotator.
+"""
 
 from __future__ import annotations
 
@@ -20,21 +22,24 @@ from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 from lidar_studio import survey_cache
 from lidar_studio.actions import (
     Action,
+    add_seed,
     apply,
-    box_of,
-    class_of,
-    frame_of,
-    motion_of,
-    numbers,
-    rounded,
-    track_of,
+    decode_action,
+    encode_action,
+    require_box,
+    require_class_name,
+    require_frame,
+    require_numbers,
+    require_track,
+    round_box,
+    with_scan_poses,
 )
 from lidar_studio.drive import Drive
 from lidar_studio.interpolation import Motion
-from lidar_studio.journal import Journal, opened
-from lidar_studio.labelled import digest_of, from_labels, joined, to_labels
-from lidar_studio.proposing import Proposer, merged
-from lidar_studio.snap import around_click, to_cluster, to_ground, to_size
+from lidar_studio.journal import Journal, open_journal
+from lidar_studio.label_conversion import compute_digest, join_extras, to_labels, to_tracks
+from lidar_studio.proposer import Proposer, merge_proposals
+from lidar_studio.snap import fit_clicked_box, resize_box, snap_to_cluster, snap_to_ground
 from lidar_studio.state import (
     ACCEPTED,
     CLICK,
@@ -44,23 +49,23 @@ from lidar_studio.state import (
     Change,
     State,
     Track,
-    progress,
+    count_progress,
     track_to_json,
 )
 
 Array = np.ndarray[Any, Any]
 
-NEARBY = 20  # frames before and after a click through which it is followed before it is answered
+NEARBY_FRAMES = 20  # frames on each side of a click through which it is tracked at once
 Listener = Callable[[dict[str, Any]], None]
 
 
-class ImportedAlready(InputError):
-    """The same labels are among those of the journal."""
+class AlreadyImportedError(InputError):
+    """The journal already contains the same imported labels."""
 
 
 class Session:
-    """May be called from several threads. listeners: told of every action, as /api/events has
-    it; busy: what goes on, as PROGRESS has it."""
+    """A labelling session; thread-safe. listeners: called with every event of /api/events; busy:
+    progress of the background task, as in `progress` of an event, or None."""
 
     def __init__(self, drive: Drive, journal: Journal,
                  detector: DetectorChoice | None = DetectorChoice()) -> None:
@@ -68,269 +73,297 @@ class Session:
         self.proposer = Proposer(drive, detector, journal.path.with_name(survey_cache.FOLDER))
         self.listeners: list[Listener] = []
         self.busy: dict[str, Any] | None = None
-        self.was_proposed = any(line.get("do") == "propose" for line in journal.lines)
-        self._end = self._next_end = threading.Event()  # of what goes on, of what waits for that
-        self._beside: threading.Thread | None = None
-        self._what = ""  # goes on there
+        self.has_proposals = any(line.get("do") == "propose" for line in journal.lines)
+        # cancel events of the running task and of the task that waits for it
+        self._cancelled = self._next_cancelled = threading.Event()
+        self._worker: threading.Thread | None = None
+        self._task = ""  # name of the worker's task, "" once it has ended
         self._lock, self._exporting = threading.RLock(), threading.Lock()
         for line in journal.lines:
-            self.state, _ = apply(self.state, line, drive.motion)
+            self.state, _ = apply(self.state, decode_action(line), drive.motion)
         journal.lines.clear()
 
     @property
     def motion(self) -> Motion:
-        """Times, and poses as far as they are known."""
-        return motion_of(self.state, self.drive.motion)
+        """Times of the frames, and poses if they are known."""
+        return with_scan_poses(self.state, self.drive.motion)
 
     def do(self, action: Mapping[str, Any], by: str = "") -> int:
-        """Do an action of a page; its number. InputError where it cannot be done, or not be
-        written: then nothing has changed."""
+        """Do an action of a page and return its number. InputError if it is invalid or cannot be
+        written; nothing has changed then."""
         if action.get("do") in ("propose", "cancel"):
-            return self.prepare(by, True) if action["do"] == "propose" else self.cancel()
+            return (self.start_proposals(by, True) if action["do"] == "propose"
+                    else self.cancel())
         with self._lock:
-            seq, name = self._record(self._computed(_asked(action)), by), action.get("do")
-            # What was made while a click was followed is undone to the track of before; one that
-            # was rejected meanwhile was followed no further.
-            again = name in ("undo", "redo", "accept", "reopen") and not self._what
-            if (name == "seed" or again) and self._waiting():
-                self._start("following", lambda: self._follow(by, None if again else seq))
+            seq = self._record(self._complete(_strip_computed(action)), by)
+            name = action.get("do")
+            # Undo restores the track from before tracking ended, and a rejected click is not
+            # tracked further, so these actions may leave a click that still has to be tracked.
+            resumes = name in ("undo", "redo", "accept", "reopen") and not self._task
+            if (name == "seed" or resumes) and self._has_waiting_clicks():
+                self._start("following", lambda: self._track_clicks(by, None if resumes else seq))
         return seq
 
     def cancel(self) -> int:
-        """End what goes on; the number of the last action."""
-        self._end.set()
-        self._next_end.set()
+        """Cancel the background task; return the number of the last action."""
+        self._cancelled.set()
+        self._next_cancelled.set()
         return self.state.seq
 
-    def prepare(self, by: str = "", anew: bool = False) -> int:
-        """Begin to look at the drive, beside the page, and write down proposals where there were
-        none yet, or anew; the number of the last action. InputError while that goes on."""
+    def start_proposals(self, by: str = "", again: bool = False) -> int:
+        """Start to survey the drive in the background and to propose tracks, if there are no
+        proposals yet or `again`. Return the number of the last action. InputError while this is
+        already running."""
         with self._lock:
-            if self._what == "proposing":
-                raise InputError("proposals are being made already")
-            self._start("proposing", lambda: self.propose(by, anew=anew or not self.was_proposed,
-                                                          asked=anew))
+            if self._task == "proposing":
+                raise InputError("proposals are already being made")
+            self._start("proposing", lambda: self.propose(by, again=again or not self.has_proposals,
+                                                          by_person=again))
         return self.state.seq
 
-    def _start(self, what: str, work: Callable[[], None]) -> None:
-        """Do what takes long in a thread of its own; what went on before ends."""
+    def _start(self, task: str, work: Callable[[], None]) -> None:
+        """Cancel the previous task and run a new one in a thread."""
         self.cancel()
-        before, own, self._what = self._beside, threading.Event(), what
-        self._next_end = own
+        previous, cancelled, self._task = self._worker, threading.Event(), task
+        self._next_cancelled = cancelled
 
-        def beside() -> None:
-            if before is not None:
-                before.join()
-            self.busy = {"what": what, "done": 0, "of": len(self.drive.frames)}
-            self._end = own  # set where it was cancelled while it waited
+        def run() -> None:
+            if previous is not None:
+                previous.join()
+            self.busy = {"what": task, "done": 0, "of": len(self.drive.frames)}
+            self._cancelled = cancelled  # already set if it was cancelled while it waited
             try:
                 work()
-            except Exception as error:  # of a thread nobody waits for: the page is told
-                self.tell({"error": str(error) if isinstance(error, InputError) else
-                           f"no proposals: {type(error).__name__}: {shorten_error(error)}"})
+            except Exception as error:  # nobody joins this thread, so the page shows the error
+                self.notify({"error": str(error) if isinstance(error, InputError) else
+                             f"no proposals: {type(error).__name__}: {shorten_error(error)}"})
             finally:
                 self.busy = None
                 with self._lock:
-                    if self._beside is threading.current_thread():
-                        self._what = ""
-                self.tell({"progress": self.progress()})
-        self._beside = threading.Thread(target=beside, daemon=True)
-        self._beside.start()
+                    if self._worker is threading.current_thread():
+                        self._task = ""
+                self.notify({"progress": self.progress()})
+        self._worker = threading.Thread(target=run, daemon=True)
+        self._worker.start()
 
     def wait(self) -> None:
-        """Until what goes on beside is done."""
-        if self._beside is not None:
-            self._beside.join()
+        """Wait until the background task has ended."""
+        if self._worker is not None:
+            self._worker.join()
 
-    def propose(self, by: str = "", here: bool = False,
-                told: Callable[[int], object] = lambda count: None, anew: bool = True,
-                asked: bool = False) -> None:
-        """Look at the drive, in a process of its own or here, and write down the proposals, with
-        anew=False only where a seed waits to be followed; nothing is written if it is cancelled.
-        told: how many frames were looked at; asked: by a person, who can undo it. InputError where
-        a frame or the weights cannot be read."""
-        def done(count: int) -> bool:
-            told(count)
-            return self._done(count)
-        self.proposer.remember()
-        self._tell_problem()
-        if self.proposer.looks is None:
-            whole = self.proposer.survey(done, here)
-            self._tell_problem()
-            if not whole:
+    def propose(self, by: str = "", in_process: bool = False,
+                on_progress: Callable[[int], object] = lambda count: None, again: bool = True,
+                by_person: bool = False) -> None:
+        """Survey the drive if that was not done yet, and record proposals; nothing if cancelled.
+
+        Args:
+            in_process: survey in this process instead of a separate one.
+            on_progress: called with the number of surveyed frames.
+            again: if False, make proposals only when a click has still to be tracked.
+            by_person: a person requested it and can undo it.
+
+        Raises:
+            InputError: a frame or the weights cannot be read.
+        """
+        def report(count: int) -> bool:
+            on_progress(count)
+            return self._report_progress(count)
+        self.proposer.load_cached()
+        self._report_problem()
+        if self.proposer.surveys is None:
+            complete = self.proposer.survey(report, in_process)
+            self._report_problem()
+            if not complete:
                 return
         with self._lock:
             if not self.state.poses and (poses := self.proposer.poses()) is not None:
                 self._record({"do": "poses", "poses": poses}, by)
-        if anew or self._waiting():
-            self._propose_all(by, None, asked)
+        if again or self._has_waiting_clicks():
+            self._propose_all(by, None, by_person)
 
-    def _tell_problem(self) -> None:
-        """What is wrong with what is kept of the survey, once."""
+    def _report_problem(self) -> None:
         if self.proposer.problem:
-            self.tell({"error": self.proposer.problem})
+            self.notify({"error": self.proposer.problem})
             self.proposer.problem = ""
 
-    def _done(self, count: int) -> bool:
-        """So many frames of what goes on; whether to go on."""
+    def _report_progress(self, count: int) -> bool:
+        """Report the number of finished frames; return False if the task is cancelled."""
         if self.busy is not None:
             self.busy = {**self.busy, "done": count}
-            self.tell({"progress": self.progress()})
-        return not self._end.is_set()
+            self.notify({"progress": self.progress()})
+        return not self._cancelled.is_set()
 
-    def _propose_all(self, by: str, seed: int | None, asked: bool = False) -> None:
-        """Follow everything through the whole drive, and write that down; with the number of the
-        action that began it as one action, if it is the last. Others may be done meanwhile."""
+    def _propose_all(self, by: str, seed: int | None, by_person: bool = False) -> None:
+        """Make proposals for the whole drive and record them. If the action number `seed` is still
+        the last one, they become part of that action. Other actions may happen meanwhile."""
         state = self.state
-        found = self.proposer.proposals(state, self.motion, None, self._done)
+        found = self.proposer.proposals(state, self.motion, None, self._report_progress)
         with self._lock:
-            if found is None or self._end.is_set() or (seed is not None and not self._waiting()):
+            if found is None or self._cancelled.is_set() or (
+                    seed is not None and not self._has_waiting_clicks()):
                 return
-            tracks, removed = merged(self.state, found, self.motion)
-            # A seed is undone with all that came of it, but never with the first proposals.
-            joins = seed == self.state.seq and self.was_proposed
-            how = {} if asked else {"joins": True} if joins else {"beside": True}
-            self._record({"do": "propose", **_made(tracks, removed), **how}, by)
-            self.was_proposed = True
+            tracks, removed = merge_proposals(self.state, found, self.motion)
+            # Undoing a seed also undoes its proposals, but never the first proposals of a drive.
+            joins = seed == self.state.seq and self.has_proposals
+            undo = {} if by_person else {"joins": True} if joins else {"beside": True}
+            self._record({"do": "propose", "tracks": tracks, "removed": removed, **undo}, by)
+            self.has_proposals = True
 
-    def _follow(self, by: str, seed: int | None) -> None:
+    def _track_clicks(self, by: str, seed: int | None) -> None:
         with self._lock:
-            waiting = self._waiting()
+            waiting = self._has_waiting_clicks()
         if waiting:
             self._propose_all(by, seed)
 
-    def _waiting(self) -> bool:
-        """Whether there is a seed that is to be followed through the whole drive."""
-        return any(t.nearby and t.placed for t in self.state.tracks.values())
+    def _has_waiting_clicks(self) -> bool:
+        return any(t.nearby and t.awaits_tracking for t in self.state.tracks.values())
 
-    def _computed(self, action: Action) -> Action:
-        """The action with what is computed for it, as the journal has it."""
+    def _complete(self, action: Action) -> Action:
+        """Return the action with everything that is computed for it."""
         name = action.get("do")
         if name == "seed":
-            return self._seeded(action)
+            return self._complete_seed(action)
         if name == "snap":
-            return {**action, "box": rounded(self._snapped(action))}
+            return {**action, "box": round_box(self._snap_box(action))}
         if name == "import":
-            return self._imported(action)
+            return self._complete_import(action)
         if name in ("accept", "reopen"):
-            track = track_of(self.state, action.get("track"))
-            clicked = track.source == CLICK and track.state == REJECTED  # it was a seed before
-            if track.boxes and (clicked or (name == "accept"
-                                            and track.class_name == CLASSES[PEDESTRIAN])):
+            track = require_track(self.state, action.get("track"))
+            was_seed = track.source == CLICK and track.state == REJECTED
+            if track.boxes and (was_seed or (name == "accept"
+                                             and track.class_name == CLASSES[PEDESTRIAN])):
                 return {**action, "seed": track.nearest_frame()}
         return action
 
-    def _imported(self, action: Action) -> Action:
-        path, named = action.get("path"), action.get("format") or ""
-        if not isinstance(path, str) or not isinstance(named, str):
+    def _complete_import(self, action: Action) -> Action:
+        path, name = action.get("path"), action.get("format") or ""
+        if not isinstance(path, str) or not isinstance(name, str):
             raise InputError("an import needs the path of labels, and may name their format")
-        labels = import_labels(Path(path), named or recognise_format(Path(path)), self.drive.frames)
-        tracks, kept = from_labels(labels, self.state.next_id)
+        labels = import_labels(Path(path), name or recognise_format(Path(path)), self.drive.frames)
+        tracks, kept = to_tracks(labels, self.state.next_id)
         before = self.state.kept
-        digest, done = digest_of(tracks, kept), before.get("imports", [])
-        if digest in done:
-            raise ImportedAlready(f"the labels of {path} were imported already; nothing was done")
-        return {**action, "tracks": [track_to_json(t) for t in tracks],
-                "kept": {**joined(before, kept), "imports": [*done, digest]}}
+        digest, imports = compute_digest(tracks, kept), before.get("imports", [])
+        if digest in imports:
+            raise AlreadyImportedError(f"the labels of {path} were already imported; nothing was "
+                                       "done")
+        return {**action, "tracks": tracks,
+                "kept": {**join_extras(before, kept), "imports": [*imports, digest]}}
 
-    def export(self, named: str, out: str, force: bool = False) -> dict[str, Any]:
-        """Write the accepted tracks in a format of exchange.FORMATS, to a path or, by its name,
-        into the journal's folder; as /api/export has it. InputError where that cannot be."""
+    def export(self, format_name: str, out: str, force: bool = False) -> dict[str, Any]:
+        """Write the accepted tracks in a format of exchange.FORMATS.
+
+        Args:
+            out: a path; relative ones are in the journal's folder.
+            force: replace existing files.
+
+        Returns:
+            The answer of /api/export: path, boxes, frames, left_out.
+
+        Raises:
+            InputError: the labels cannot be written there.
+        """
         path = Path(out).expanduser()
         if not out or ".." in path.parts:
-            raise InputError(f"{out!r} is no name for an export; give one without '..'")
+            raise InputError(f"{out!r} is not a valid name for an export; give one without '..'")
         path = self.journal.path.parent / path
         if path.resolve() == self.journal.path.resolve():
             raise InputError(f"{path} is the journal of these labels; give another name")
         with self._exporting:  # a button may be pressed twice
-            written = export_labels(to_labels(self.state, self.drive.frames), named, path,
+            written = export_labels(to_labels(self.state, self.drive.frames), format_name, path,
                                     self.drive.frames, force)
-        nearby = [t.id for t in self.state.tracks.values() if t.nearby and t.placed]
+        nearby = [t.id for t in self.state.tracks.values() if t.nearby and t.awaits_tracking]
         return {"path": str(written.path), "boxes": written.boxes, "frames": written.frames,
                 "left_out": [*written.left_out, *(
-                    [f"the rest of tracks that are being followed: {nearby}"] if nearby else [])]}
+                    [f"later boxes of tracks that are still being tracked: {nearby}"]
+                    if nearby else [])]}
 
-    def _seeded(self, action: Action) -> Action:
-        frame, named = frame_of(action, self.drive.motion), class_of(action)
-        click = np.array(numbers(action, "xyz", 3))
-        box = around_click(self.drive.clouds(frame), click, named)
-        box = self.proposer.detected(frame, box, named)
-        track = Track(self.state.next_id, named, ACCEPTED, 1.0, CLICK,
-                      {frame: Box(tuple(rounded(box)), KEY)})
-        alone = {**action, "track": track.id, "tracks": [track_to_json(track)]}
-        if self.proposer.looks is None:
-            return alone
-        state = apply(self.state, alone, self.drive.motion)[0]
-        motion, count = motion_of(state, self.drive.motion), len(self.drive.frames)
-        nearby = range(max(frame - NEARBY, 0), min(frame + NEARBY + 1, count))
-        some = count > 2 * NEARBY
-        found = self.proposer.proposals(state, motion, nearby if some else None)
-        tracks, removed = merged(state, found or [], motion)
-        if some:  # what is known of the frames around says nothing of what is there already
+    def _complete_seed(self, action: Action) -> Action:
+        frame, class_name = require_frame(action, self.drive.motion), require_class_name(action)
+        click = np.array(require_numbers(action, "xyz", 3))
+        box = fit_clicked_box(self.drive.load_scan(frame), click, class_name)
+        box = self.proposer.refine_with_detection(frame, box, class_name)
+        track = Track(self.state.next_id, class_name, ACCEPTED, 1.0, CLICK,
+                      {frame: Box(tuple(round_box(box)), KEY)})
+        action = {**action, "track": track.id}
+        if self.proposer.surveys is None:
+            return {**action, "tracks": [track]}
+        state = replace(self.state, tracks={**self.state.tracks, track.id: track},
+                        seeds=add_seed(self.state.seeds, frame, track.id), next_id=track.id + 1)
+        count = len(self.drive.frames)
+        nearby = range(max(frame - NEARBY_FRAMES, 0), min(frame + NEARBY_FRAMES + 1, count))
+        is_long = count > 2 * NEARBY_FRAMES
+        found = self.proposer.proposals(state, self.motion, nearby if is_long else None)
+        tracks, removed = merge_proposals(state, found or [], self.motion)
+        if is_long:  # proposals for the nearby frames cannot replace tracks of the whole drive
             tracks = [t for t in tracks if t.id == track.id or t.id not in state.tracks]
             removed = []
         own = next((t for t in tracks if t.id == track.id), track)
-        tracks = [t for t in tracks if t is not own] + [replace(own, nearby=some)]
-        return {**alone, **_made(tracks, removed)}
+        tracks = [t for t in tracks if t is not own] + [replace(own, nearby=is_long)]
+        return {**action, "tracks": tracks, "removed": removed}
 
-    def _snapped(self, action: Action) -> Array:
-        track, frame = track_of(self.state, action.get("track")), frame_of(action,
-                                                                          self.drive.motion)
-        box = np.array(box_of(track, frame).values)
+    def _snap_box(self, action: Action) -> Array:
+        track = require_track(self.state, action.get("track"))
+        frame = require_frame(action, self.drive.motion)
+        box = np.array(require_box(track, frame).values)
         if action.get("to") == "size":
             others = [b.values[3:6] for f, b in track.boxes.items() if f != frame]
             keys = [b.values[3:6] for f, b in track.boxes.items() if f != frame and b.kind == KEY]
-            return to_size(box, np.median(keys or others or [tuple(box[3:6])], axis=0))
+            return resize_box(box, np.median(keys or others or [tuple(box[3:6])], axis=0))
         if action.get("to") not in ("cluster", "ground"):
             raise InputError("a box snaps to cluster, ground or size")
-        scan = self.drive.clouds(frame)
-        return to_cluster(scan, box) if action["to"] == "cluster" else to_ground(scan, box)
+        scan = self.drive.load_scan(frame)
+        return snap_to_cluster(scan, box) if action["to"] == "cluster" else snap_to_ground(scan,
+                                                                                           box)
 
     def _record(self, action: Action, by: str) -> int:
+        """Apply an action, write it to the journal, and notify the listeners."""
         after, change = apply(self.state, action, self.drive.motion)
+        encoded: dict[int, dict[str, Any]] = {}
+
+        def encode(track: Track) -> dict[str, Any]:
+            if track.id not in encoded:
+                encoded[track.id] = track_to_json(track)
+            return encoded[track.id]
         self.journal.append({"seq": after.seq, "time": datetime.now(UTC).isoformat(), "by": by,
-                             **action})
+                             **encode_action(action, encode)})
         self.state = after
-        self._tell(action, change, by)
+        self._notify_change(action, change, by, encode)
         return after.seq
 
-    def _tell(self, action: Action, change: Change, by: str) -> None:
-        tracks = [track_to_json(track) for _, track in change.tracks.values() if track]
+    def _notify_change(self, action: Action, change: Change, by: str,
+                       encode: Callable[[Track], dict[str, Any]]) -> None:
+        tracks = [encode(track) for _, track in change.tracks.values() if track]
         removed = [n for n, (_, track) in change.tracks.items() if track is None]
-        named = {k: v for k, v in action.items() if k not in ("tracks", "removed", "poses", "kept")
+        shown = {k: v for k, v in action.items() if k not in ("tracks", "removed", "poses", "kept")
                  or action["do"] == "merge"}
-        self.tell({"seq": self.state.seq, "by": by, "action": named, "tracks": tracks,
-                   "removed": removed, **self.summary()})
+        self.notify({"seq": self.state.seq, "by": by, "action": shown, "tracks": tracks,
+                     "removed": removed, **self.summary()})
 
-    def tell(self, event: dict[str, Any]) -> None:
-        """All listeners."""
+    def notify(self, event: dict[str, Any]) -> None:
+        """Call all listeners with an event."""
         for listener in list(self.listeners):
             listener(event)
 
     def progress(self) -> dict[str, Any]:
-        """How far the work is, and what goes on."""
-        return {**progress(self.state, len(self.drive.frames)), "busy": self.busy}
+        """Counts of tracks and frames, and the state of the background task."""
+        return {**count_progress(self.state, len(self.drive.frames)), "busy": self.busy}
 
     def summary(self) -> dict[str, Any]:
-        """All but the tracks, as the page has it."""
+        """The state without the tracks, as in every event."""
         state = self.state
         return {"checked": sorted(state.checked), "seeds": [list(s) for s in state.seeds],
-                "can_undo": state.done is not None, "can_redo": state.undone is not None,
-                "progress": self.progress()}
+                "can_undo": state.undo_stack is not None,
+                "can_redo": state.redo_stack is not None, "progress": self.progress()}
 
-    def everything(self) -> dict[str, Any]:
-        """As /api/state has it."""
+    def to_json(self) -> dict[str, Any]:
+        """The answer of /api/state."""
         with self._lock:
             return {"seq": self.state.seq, **self.summary(),
                     "tracks": [track_to_json(t) for t in self.state.tracks.values()]}
 
 
-def _made(tracks: list[Track], removed: list[int]) -> dict[str, Any]:
-    return {"tracks": [track_to_json(t) for t in tracks], "removed": removed}
-
-
-def _asked(action: Mapping[str, Any]) -> Action:
-    """What a page may say of an action; what is computed for it, it may not."""
+def _strip_computed(action: Mapping[str, Any]) -> Action:
+    """Remove the fields that the session computes, which a page must not set."""
     if action.get("do") == "poses":
         raise InputError("poses come from the drive")
     computed = {"seed": ("track", "tracks", "removed"), "propose": ("tracks", "removed"),
@@ -341,14 +374,14 @@ def _asked(action: Mapping[str, Any]) -> Action:
 
 
 @contextmanager
-def session(drive: Drive, folder: Path,
-            detector: DetectorChoice | None = DetectorChoice()) -> Iterator[Session]:
-    """The labels of a drive in a folder, gone on with from where they were left. InputError for the
-    journal of another drive, and while another process has it."""
-    with opened(folder, drive.known_by) as journal:
-        made = Session(drive, journal, detector)
-        made.proposer.remember()
+def open_session(drive: Drive, folder: Path,
+                 detector: DetectorChoice | None = DetectorChoice()) -> Iterator[Session]:
+    """Open the labels of a drive in a folder, as its journal left them. InputError for the journal
+    of another drive, and while another process has it open."""
+    with open_journal(folder, drive.journal_header) as journal:
+        session = Session(drive, journal, detector)
+        session.proposer.load_cached()
         try:
-            yield made
+            yield session
         finally:
-            made.cancel()
+            session.cancel()

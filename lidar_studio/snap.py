@@ -1,4 +1,4 @@
-"""Boxes put right by the points: around the cluster, onto the ground, to a size."""
+"""Fitting of boxes to points: around a cluster, onto the ground, to a given size."""
 
 from __future__ import annotations
 
@@ -16,69 +16,76 @@ from lidar_perception.types import InputError
 from lidar_studio.drive import Scan
 
 Array = np.ndarray[Any, Any]
-MARGIN = 0.3       # metres around a box within which its cluster is looked for
-NEAREST, FARTHEST = 20, 15.0  # points of the ground, and metres, where few are near
-PIECE = 0.2        # of the points of the largest cluster there: smaller ones are something else
-PIECES = 0.55      # of the usual length: so far from a click there are pieces of the same vehicle,
-MOST = 0.8         # if more of their points than this are there
-BESIDE = 0.1       # metres beyond its nearest point that are taken at least
-LARGER = 1.5       # times the usual length: more than the object that was clicked
-LONG = 2.5         # metres: what is usually longer hides its far side
-WIDER = 1.3        # times the width: a side that is no longer than this is the front or the rear
+BOX_MARGIN_M = 0.3            # around a box, when searching its cluster
+MIN_GROUND_POINTS = 20        # nearest ground points, used if there are none below the box,
+MAX_GROUND_DISTANCE_M = 15.0  # and how far away they may be
+MIN_PIECE_SHARE = 0.2         # of the largest cluster in a box; smaller ones are other objects
+PIECE_REACH = 0.55            # of the usual length: range around a click with parts of a vehicle
+MIN_INSIDE_SHARE = 0.8        # of a cluster's points in that range, to be such a part
+MIN_REACH_M = 0.1             # beyond the point of a cluster nearest to the click
+MAX_LENGTH_RATIO = 1.5        # to the usual length; a longer cluster contains other objects
+LONG_OBJECT_M = 2.5           # usual length from which the far side is hidden
+MAX_END_RATIO = 1.3           # to the width; a side up to this is the front or the rear
 
 
-def around_click(scan: Scan, click: Array, class_name: str) -> Array:
-    """(7,) the box of the cluster at a point (3,), on the ground and as large as the class usually
-    is. InputError where no cluster is near."""
+def fit_clicked_box(scan: Scan, click: Array, class_name: str) -> Array:
+    """Return the box (7,) of the cluster at a point (3,), on the ground and at least as large as
+    is usual for the class. InputError if there is no cluster near the point."""
     label = find_clicked_cluster(click, scan.xyz, scan.cluster_ids, SeedParams().click_radius)
     members = scan.cluster_ids == label
-    usual = usual_size(class_name)
-    if usual is not None and usual[0] > LONG:  # of which one cluster is often but a piece
-        near = np.hypot(*(scan.xyz[:, :2] - click[:2]).T) < usual[0] * PIECES
-        inside, whole = (np.bincount(scan.cluster_ids[mask], minlength=scan.cluster_ids.max() + 1)
+    usual = find_usual_size(class_name)
+    if usual is not None and usual[0] > LONG_OBJECT_M:  # often split into several clusters
+        near = np.hypot(*(scan.xyz[:, :2] - click[:2]).T) < usual[0] * PIECE_REACH
+        inside, total = (np.bincount(scan.cluster_ids[mask], minlength=scan.cluster_ids.max() + 1)
                          for mask in (near, slice(None)))
-        members |= ((inside > MOST * whole) & (np.arange(len(whole)) > 0))[scan.cluster_ids]
-    box = _around(scan, members)
-    if usual is not None and box[3] > LARGER * usual[0]:  # it has grown together with others
-        apart = np.hypot(*(scan.xyz[:, :2] - click[:2]).T)
-        reach = max(usual[0] * PIECES, apart[members].min() + BESIDE)  # also of a click beside it
-        box = _around(scan, members & (apart < reach))
-    return completed(box, usual)
+        is_part = (inside > MIN_INSIDE_SHARE * total) & (np.arange(len(total)) > 0)
+        members |= is_part[scan.cluster_ids]
+    box = _fit_box(scan, members)
+    if usual is not None and box[3] > MAX_LENGTH_RATIO * usual[0]:  # merged with other objects
+        distances = np.hypot(*(scan.xyz[:, :2] - click[:2]).T)
+        # A click may miss the cluster by more than the first term.
+        reach = max(usual[0] * PIECE_REACH, distances[members].min() + MIN_REACH_M)
+        box = _fit_box(scan, members & (distances < reach))
+    return complete_box(box, usual)
 
 
-def to_cluster(scan: Scan, box: Array) -> Array:
-    """(7,) the L-shape of the cluster in a box (7,), headed as that is. InputError where no cluster
-    is in it."""
-    near = points_in_box(scan.xyz, box, MARGIN) & (scan.cluster_ids > 0)
+def snap_to_cluster(scan: Scan, box: Array) -> Array:
+    """Return the L-shape (7,) of the cluster in a box (7,), with the heading nearest to the box's.
+    InputError if there is no cluster in the box."""
+    near = points_in_box(scan.xyz, box, BOX_MARGIN_M) & (scan.cluster_ids > 0)
     counts = np.bincount(scan.cluster_ids[near], minlength=scan.cluster_ids.max(initial=0) + 1)
     if not counts.any():
         raise InputError("there is no cluster in the box; move it onto one")
-    return headed(_around(scan, near & (counts[scan.cluster_ids] >= PIECE * counts.max())), box[6])
+    is_large = counts >= MIN_PIECE_SHARE * counts.max()
+    return align_heading(_fit_box(scan, near & is_large[scan.cluster_ids]), box[6])
 
 
-def to_ground(scan: Scan, box: Array) -> Array:
-    """(7,) the box with its bottom on the ground under it. InputError where none is seen there."""
-    floor = _floor(scan, box)
+def snap_to_ground(scan: Scan, box: Array) -> Array:
+    """Return the box (7,) moved vertically onto the ground. InputError if no ground is visible
+    there."""
+    floor = _find_ground_height(scan, box)
     if not np.isfinite(floor):
-        raise InputError("no ground is seen around the box; move it by hand")
+        raise InputError("no ground points around the box; move it by hand")
     return np.array([*box[:2], floor + box[5] / 2, *box[3:]])
 
 
-def _floor(scan: Scan, box: Array) -> float:
-    """z of the ground under a box (7,), or of the nearest ground where few of its points are seen;
-    NaN where there is none."""
+def _find_ground_height(scan: Scan, box: Array) -> float:
+    """Return the z of the ground under a box (7,), else of the nearest ground points; NaN if those
+    are too far away."""
     ground = scan.xyz[scan.ground]
     floor = float(fit_ground_heights(ground, box[None, :2])[0])
-    if np.isfinite(floor) or len(ground) < NEAREST:
+    if np.isfinite(floor) or len(ground) < MIN_GROUND_POINTS:
         return floor
-    apart = np.hypot(*(ground[:, :2] - box[:2]).T)
-    nearest = np.argpartition(apart, NEAREST - 1)[:NEAREST]
-    return float(np.median(ground[nearest, 2])) if apart[nearest].max() <= FARTHEST else np.nan
+    distances = np.hypot(*(ground[:, :2] - box[:2]).T)
+    nearest = np.argpartition(distances, MIN_GROUND_POINTS - 1)[:MIN_GROUND_POINTS]
+    if distances[nearest].max() > MAX_GROUND_DISTANCE_M:
+        return np.nan
+    return float(np.median(ground[nearest, 2]))
 
 
-def to_size(box: Array, size: Array) -> Array:
-    """(7,) the box with another length, width and height; the corner that is nearest to the sensor
-    stays where it is, and so does the bottom."""
+def resize_box(box: Array, size: Array) -> Array:
+    """Return the box (7,) with another length, width and height (3,); the corner nearest to the
+    sensor and the bottom stay in place."""
     cos, sin = np.cos(box[6]), np.sin(box[6])
     seen = to_box_frame(np.zeros((1, 3)), box)[0, :2]
     away = -np.where(np.abs(seen) > box[3:5] / 2, np.sign(seen), 0.0)
@@ -87,40 +94,42 @@ def to_size(box: Array, size: Array) -> Array:
                      box[2] + (size[2] - box[5]) / 2, *size, box[6]])
 
 
-def headed(box: Array, yaw: float) -> Array:
-    """(7,) the same box, of the four ways to say it that whose yaw is nearest."""
+def align_heading(box: Array, yaw: float) -> Array:
+    """Return the same box (7,) in the one of its four equivalent forms whose yaw is nearest."""
     turns = round(float(wrap_angle(yaw - box[6])) / (np.pi / 2))
     sides = box[3:5] if turns % 2 == 0 else box[[4, 3]]
     return np.array([*box[:3], *sides, box[5], wrap_angle(box[6] + turns * np.pi / 2)])
 
 
-def usual_size(class_name: str) -> Size | None:
-    """Of a class that is detected; None of others."""
+def find_usual_size(class_name: str) -> Size | None:
+    """Return the mean size of a detected class; None for other classes."""
     return DETECTED[class_name].mean_size if class_name in DETECTED else None
 
 
-def completed(box: Array, usual: Size | None) -> Array:
-    """(7,) the box of what is seen, made as long and wide as its class usually is. People are seen
-    through and through, so theirs grows evenly; others grow away from the sensor, and a side that
-    is hardly longer than the width is taken for the width."""
+def complete_box(box: Array, usual: Size | None) -> Array:
+    """Enlarge the box (7,) of visible points to the usual size of the class.
+
+    Boxes of people grow evenly. Those of vehicles grow away from the sensor, and a longer side up
+    to MAX_END_RATIO times the usual width is taken as the width.
+    """
     if usual is None:
         return box
     length, width, height = usual
-    vehicle = length > LONG
-    if vehicle and box[3] < WIDER * width:
-        box = headed(box, box[6] + np.pi / 2)
+    vehicle = length > LONG_OBJECT_M
+    if vehicle and box[3] < MAX_END_RATIO * width:
+        box = align_heading(box, box[6] + np.pi / 2)
     size = np.array([max(box[3], length), max(box[4], width),
                      box[5] if box[5] > height / 2 else height])
     if vehicle:
-        return to_size(box, size)
+        return resize_box(box, size)
     return np.array([*box[:2], box[2] + (size[2] - box[5]) / 2, *size, box[6]])
 
 
-def _around(scan: Scan, members: Array) -> Array:
-    """(7,) the L-shape around points (N,) bool, down to the ground."""
+def _fit_box(scan: Scan, members: Array) -> Array:
+    """Return the L-shape (7,) around the selected points (N,) bool, down to the ground."""
     xyz = scan.xyz[members]
     box = fit_boxes(xyz, np.ones(len(xyz), np.int32), "l_shape")[0].astype(np.float64)
-    floor = _floor(scan, box)
+    floor = _find_ground_height(scan, box)
     if np.isfinite(floor):
         top = max(box[2] + box[5] / 2, floor + 0.1)
         box[2], box[5] = (floor + top) / 2, top - floor

@@ -1,7 +1,6 @@
-"""The labels of a drive as they are being made: tracks of boxes, and what has been done to them.
+"""Immutable state of a labelling session: tracks of boxes, seeds, checked frames, undo history.
 
-A State never changes; actions.py makes the next one of it. Boxes are in the LiDAR frame of their
-own scan.
+actions.py computes the next state. Each box is in the LiDAR frame of its frame.
 """
 
 from __future__ import annotations
@@ -14,29 +13,33 @@ from typing import Any, NamedTuple
 import numpy as np
 
 KEY, PROPOSED, INTERPOLATED = "key", "proposed", "interpolated"  # kinds of boxes
-ACCEPTED, REJECTED = "accepted", "rejected"                      # of tracks, beside PROPOSED
-CLICK = "click"  # source of a track that a person clicked, to be followed through the drive
+ACCEPTED, REJECTED = "accepted", "rejected"                      # of tracks, as is PROPOSED
+CLICK = "click"  # source of a track that a person clicked; it is then tracked through the drive
 
 
 class Box(NamedTuple):
-    """[x y z l w h yaw] and where it comes from: KEY, from a person; PROPOSED; INTERPOLATED,
-    between key boxes."""
+    """[x y z l w h yaw] and its kind: KEY (set by a person), PROPOSED or INTERPOLATED (between key
+    boxes)."""
 
     values: tuple[float, ...]
     kind: str
 
     @staticmethod
     def of(values: np.ndarray[Any, Any], kind: str) -> Box:
-        """The box of an array (7,) float64."""
+        """Make a box from an array (7,) float64."""
         return Box(tuple(values.tolist()), kind)
 
 
 @dataclass(frozen=True)
 class Track:
-    """One object through the drive. boxes by frame; gone: frames where a person removed its box;
-    extra: by frame, what an imported label says besides, to be exported again; edited: a person
-    gave it its class, or cut or joined it; nearby: it was clicked, and is followed only through the
-    frames around that yet."""
+    """One object over the frames of a drive.
+
+    boxes: by frame.
+    gone: frames from which a person removed the box.
+    extra: by frame, further fields of an imported label, which are exported again.
+    edited: a person changed the class, or split or merged the track.
+    nearby: it was clicked, and so far tracked only through the frames around the click.
+    """
 
     id: int
     class_name: str
@@ -50,59 +53,64 @@ class Track:
     nearby: bool = False
 
     @property
-    def touched(self) -> bool:
-        """Whether a person has had a hand in it."""
+    def has_human_edits(self) -> bool:
+        """True if a person decided on the track or changed it."""
         return (self.state != PROPOSED or self.edited or bool(self.gone)
                 or any(box.kind == KEY for box in self.boxes.values()))
 
     @property
-    def placed(self) -> bool:
-        """Whether a person clicked it, and it waits to be followed through the drive."""
+    def awaits_tracking(self) -> bool:
+        """True for a clicked track that was not yet tracked through the whole drive."""
         return (self.source == CLICK and self.state != REJECTED and not self.edited
                 and (len(self.boxes) == 1 or self.nearby))
 
     @property
     def uncertainty(self) -> float:
-        """0..1: how near the score is to the threshold, a half."""
+        """1 at a score of 0.5, falling to 0 at scores of 0 and 1."""
         return 1.0 - 2.0 * abs(self.score - 0.5)
 
     def nearest_frame(self) -> int:
-        """The frame in which it is nearest to the sensor."""
+        """Return the frame in which the object is nearest to the sensor; 0 without boxes."""
         return min(self.boxes, key=lambda f: (math.hypot(*self.boxes[f].values[:2]), f), default=0)
 
 
 class Change(NamedTuple):
-    """What one action changed, before and after: tracks by id (None: not there), seeds, checked
-    frames, what imported files said besides."""
+    """Values before and after an action: tracks by id (None if absent), seeds, checked frames, and
+    the extras of imported files."""
 
     tracks: Mapping[int, tuple[Track | None, Track | None]]
     seeds: tuple[Seeds, Seeds]
     checked: tuple[frozenset[int], frozenset[int]]
     kept: tuple[Kept, Kept]
 
-    def then(self, later: Change) -> Change:
-        """This change and one after it, as one."""
+    def combine_with(self, later: Change) -> Change:
+        """Return this change and a later one as a single change."""
         tracks = {n: (self.tracks[n] if n in self.tracks else later.tracks[n])[:1]
                   + (later.tracks[n] if n in later.tracks else self.tracks[n])[1:]
                   for n in (*self.tracks, *later.tracks)}
         return Change(tracks, (self.seeds[0], later.seeds[1]),
                       (self.checked[0], later.checked[1]), (self.kept[0], later.kept[1]))
 
-    def turned_round(self) -> Change:
-        """The change that takes it back."""
+    def invert(self) -> Change:
+        """Return the change that undoes this one."""
         return Change({k: (after, before) for k, (before, after) in self.tracks.items()},
                       self.seeds[::-1], self.checked[::-1], self.kept[::-1])
 
 
 Seeds = tuple[tuple[int, int], ...]    # (frame, track id)
-Kept = Mapping[str, Any]               # "notes" by frame, "extra": see labelled.py
+Kept = Mapping[str, Any]               # "notes" by frame, "extra": see label_conversion.py
 Stack = tuple[Change, Any] | None      # a change, and the stack below it: shared between states
 
 
 @dataclass(frozen=True)
 class State:
-    """seq: number of the last action; next_id: no track ever had it; done and undone: what can be
-    undone and redone; poses: (F, 16) of the sensor by the scans, where the drive has none."""
+    """The labels after an action.
+
+    seq: number of that action.
+    next_id: an id that no track has had yet.
+    kept: extras of imported files.
+    poses: (F, 16) of the sensor, from scan matching, if the recording has none.
+    """
 
     tracks: Mapping[int, Track] = field(default_factory=dict)
     seeds: Seeds = ()
@@ -111,11 +119,11 @@ class State:
     next_id: int = 1
     kept: Kept = field(default_factory=dict)
     poses: tuple[tuple[float, ...], ...] = ()
-    done: Stack = None
-    undone: Stack = None
+    undo_stack: Stack = None
+    redo_stack: Stack = None
 
-    def after(self, change: Change) -> State:
-        """With the change made; the stacks stay."""
+    def with_change(self, change: Change) -> State:
+        """Return the state with the change applied; undo and redo stacks stay as they are."""
         tracks = dict(self.tracks)
         for number, (_, track) in change.tracks.items():
             if track is None:
@@ -128,7 +136,7 @@ class State:
 
 
 def track_to_json(track: Track) -> dict[str, Any]:
-    """As the page and the journal have it."""
+    """Convert a track to the JSON object of the page and the journal."""
     found = {"id": track.id, "class": track.class_name, "state": track.state,
              "score": track.score, "source": track.source,
              "boxes": [[f, *b.values, b.kind] for f, b in sorted(track.boxes.items())],
@@ -141,7 +149,7 @@ def track_to_json(track: Track) -> dict[str, Any]:
 
 
 def track_from_json(found: Mapping[str, Any]) -> Track:
-    """The inverse of track_to_json."""
+    """Make a track from the object of track_to_json."""
     boxes = {int(f): Box(tuple(map(float, values)), kind)
              for f, *values, kind in found["boxes"]}
     return Track(int(found["id"]), str(found["class"]), found["state"], float(found["score"]),
@@ -150,11 +158,14 @@ def track_from_json(found: Mapping[str, Any]) -> Track:
                  found.get("edited", False), found.get("nearby", False))
 
 
-def next_uncertain(state: State, after: int | None = None,
-                   among: Callable[[Track], bool] = lambda track: True) -> Track | None:
-    """The proposed track, of some, whose score is nearest to the threshold, or, given one of these,
-    the next; after the last the first again. Ties by id."""
-    waiting = sorted((t for t in state.tracks.values() if t.state == PROPOSED and among(t)),
+def find_next_uncertain(state: State, after: int | None = None,
+                        condition: Callable[[Track], bool] = lambda track: True) -> Track | None:
+    """Return the most uncertain proposed track that meets a condition.
+
+    With the id of such a track in `after`, return the next one, wrapping around at the end. Ties
+    are ordered by id. None if there is no such track.
+    """
+    waiting = sorted((t for t in state.tracks.values() if t.state == PROPOSED and condition(t)),
                      key=lambda t: (-t.uncertainty, t.id))
     if not waiting:
         return None
@@ -162,8 +173,8 @@ def next_uncertain(state: State, after: int | None = None,
     return waiting[(place + 1) % len(waiting)]
 
 
-def progress(state: State, frames: int) -> dict[str, int]:
-    """How far the work is."""
+def count_progress(state: State, frames: int) -> dict[str, int]:
+    """Count tracks by state, checked frames and actions, as the page shows them."""
     states = [t.state for t in state.tracks.values()]
     accepted, rejected = states.count(ACCEPTED), states.count(REJECTED)
     return {"tracks": len(states), "accepted": accepted, "rejected": rejected,

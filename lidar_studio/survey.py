@@ -1,5 +1,5 @@
-"""What is looked at once in each frame of a drive, so that proposals for another seed take no
-time: what a detector finds, and the clusters that may be people or things."""
+"""Survey of a drive: detections and candidate clusters of every frame, computed once, so that
+proposals for a further seed are fast."""
 
 from __future__ import annotations
 
@@ -24,57 +24,67 @@ from lidar_perception.groups import group_points
 from lidar_perception.runs.processes import run_in_processes
 from lidar_perception.tracking.ego import Odometry, choose_recorded_source
 from lidar_perception.types import Detections
-from lidar_studio.drive import Drive, one_drive, settings
+from lidar_studio.drive import Drive, make_pipeline_params, select_drive
 
 Array = np.ndarray[Any, Any]
-LEAST_SCORE = 0.1             # of a detection: tracks make something of weak ones
-HEIGHTS = 0.9, 2.4            # metres of a person above the ground
-WIDEST = 2.0                  # metres of one's cluster seen from above
-FEWEST = 5                    # points of one
-THINGS = 0.7, 4.5             # metres above the ground of what else may be a seed's like,
-LONGEST = 14.0                # the longest side of its cluster,
-FEWEST_OF_THING = 10          # and its points
+MIN_DETECTION_SCORE = 0.1    # low, as tracking filters weak detections
+PERSON_HEIGHTS_M = 0.9, 2.4  # above the ground
+MAX_PERSON_WIDTH_M = 2.0     # diagonal of the cluster in BEV
+MIN_PERSON_POINTS = 5
+OBJECT_HEIGHTS_M = 0.7, 4.5  # above the ground
+MAX_OBJECT_LENGTH_M = 14.0   # diagonal of the cluster in BEV
+MIN_OBJECT_POINTS = 10
 
 
 @dataclass(frozen=True)
-class Look:
-    """Of one frame: detections; and C clusters that may be people: boxes (C, 7) on the ground,
-    silhouettes (C, 80) uint32, and their features by name, (C,) each. things (T, 7): the L-shapes
-    of clusters of any kind, on the ground. pose (4, 4) in the first frame, by the scans, where the
-    drive has none of its own."""
+class FrameSurvey:
+    """Survey of one frame: detections, clusters that may be people, and clusters of any object.
+
+    boxes: (C, 7) of clusters that may be people, down to the ground.
+    images: (C, 80) uint32, their silhouettes.
+    features: by name, (C,) each; empty for C = 0.
+    shapes: (T, 7) L-shapes of clusters of any object, down to the ground.
+    pose: (4, 4) in the first frame, from scan matching; None if the drive has poses.
+    """
 
     detections: Detections
     boxes: Array
     images: Array
     features: dict[str, Array]
-    things: Array
+    shapes: Array
     pose: Array | None = None
 
 
-def look_at(frame: Frame, detector: Detector | None = None,
-            odometry: Odometry | None = None) -> Look:
-    """See Look; without a detector there are no detections, and without odometry, which is given
-    the frames in their order, no pose. InputError where the frame cannot be read."""
-    cloud, params = frame.load(), settings(frame)
+def survey_frame(frame: Frame, detector: Detector | None = None,
+                 odometry: Odometry | None = None) -> FrameSurvey:
+    """Survey a frame. Without a detector there are no detections, and without odometry, which
+    needs all frames in order, there is no pose. InputError if the frame cannot be read."""
+    cloud, params = frame.load(), make_pipeline_params(frame)
     found = segment_cloud(cloud, None, params)
     detections = Detections.none() if detector is None else detector(cloud).detections
     pose = None if odometry is None else odometry(cloud.xyz)
     counts = np.bincount(found.cluster_ids, minlength=len(found.boxes) + 1)[1:]
-    people = np.flatnonzero((found.boxes[:, 5] >= HEIGHTS[0]) & (found.boxes[:, 5] <= HEIGHTS[1])
-                            & (np.hypot(found.boxes[:, 3], found.boxes[:, 4]) <= WIDEST)
-                            & (counts >= FEWEST))
-    boxes, things = found.boxes[people], _things(found, counts)
+    people = _find_clusters(found.boxes, counts, PERSON_HEIGHTS_M, MAX_PERSON_WIDTH_M,
+                            MIN_PERSON_POINTS)
+    boxes, shapes = found.boxes[people], _fit_objects(found, counts)
     if len(people) == 0:
-        return Look(detections, boxes, np.zeros((0, ROWS), np.uint32), {}, things, pose)
-    return Look(detections, boxes, *_described(found.xyz, found.cluster_ids, boxes, people + 1,
-                                               params), things, pose)
+        return FrameSurvey(detections, boxes, np.zeros((0, ROWS), np.uint32), {}, shapes, pose)
+    images, features = _describe_people(found.xyz, found.cluster_ids, boxes, people + 1, params)
+    return FrameSurvey(detections, boxes, images, features, shapes, pose)
 
 
-def _things(found: SegmentedCloud, counts: Array) -> Array:
-    """(T, 7) float32."""
-    height, across = found.boxes[:, 5], np.hypot(found.boxes[:, 3], found.boxes[:, 4])
-    chosen = np.flatnonzero((height >= THINGS[0]) & (height <= THINGS[1]) & (across <= LONGEST)
-                            & (counts >= FEWEST_OF_THING))
+def _find_clusters(boxes: Array, counts: Array, heights: tuple[float, float], max_diagonal: float,
+                   min_points: int) -> Array:
+    """Return the indices of clusters of a size, (K,) int."""
+    return np.flatnonzero((boxes[:, 5] >= heights[0]) & (boxes[:, 5] <= heights[1])
+                          & (np.hypot(boxes[:, 3], boxes[:, 4]) <= max_diagonal)
+                          & (counts >= min_points))
+
+
+def _fit_objects(found: SegmentedCloud, counts: Array) -> Array:
+    """Fit the L-shapes (T, 7) float32 of clusters of object size."""
+    chosen = _find_clusters(found.boxes, counts, OBJECT_HEIGHTS_M, MAX_OBJECT_LENGTH_M,
+                            MIN_OBJECT_POINTS)
     numbers = np.zeros(len(found.boxes) + 1, np.int32)
     numbers[chosen + 1] = np.arange(1, len(chosen) + 1)
     labels = numbers[found.cluster_ids]
@@ -83,56 +93,56 @@ def _things(found: SegmentedCloud, counts: Array) -> Array:
     return shapes
 
 
-def _described(xyz: Array, cluster_ids: Array, boxes: Array, numbers: Array,
-               params: PipelineParams) -> tuple[Array, dict[str, Array]]:
+def _describe_people(xyz: Array, cluster_ids: Array, boxes: Array, numbers: Array,
+                     params: PipelineParams) -> tuple[Array, dict[str, Array]]:
     points, start = group_points(xyz, cluster_ids, numbers)
     floors = (boxes[:, 2] - boxes[:, 5] / 2).astype(np.float64)
     images = draw_silhouettes(points, start, np.ones((len(boxes), 1)), floors, params)
     return images, compute_shape_features(points, start, boxes, params)
 
 
-def surveyed(drive: Drive, choice: DetectorChoice | None, here: bool = False,
-             first: int = 0) -> Generator[Look | None, None, None]:
-    """Yield the looks of all frames from `first` on, in their order.
+def survey_drive(drive: Drive, choice: DetectorChoice | None, in_process: bool = False,
+                 first: int = 0) -> Generator[FrameSurvey | None, None, None]:
+    """Yield the surveys of all frames from `first` on, in order.
 
     Args:
         choice: the detector, or None.
-        here: look in this process, not in a separate one that ends with the iterator.
-        first: None is yielded for each earlier frame that the poses from the scans need again.
+        in_process: run in this process, not in a separate one that ends with the iterator.
+        first: for earlier frames, None is yielded if scan matching has to read them again.
 
     Raises:
         InputError: a frame or the detector's weights cannot be read.
     """
     reopen = drive.recording.reopen
-    frames = list(range(0 if _by_scans(drive) else first, len(drive.frames)))
-    if here or reopen is None:
-        yield from map(_here(drive, choice, first), frames)
+    frames = list(range(0 if _needs_odometry(drive) else first, len(drive.frames)))
+    if in_process or reopen is None:
+        yield from map(_make_surveyor(drive, choice, first), frames)
         return
     sequence = drive.frames[0].sequence
-    yield from run_in_processes(partial(_elsewhere, reopen, choice, sequence, first), frames, 1,
-                                "looked for proposals", apart=True)
+    start = partial(_make_process_surveyor, reopen, choice, sequence, first)
+    yield from run_in_processes(start, frames, 1, "surveyed frames", apart=True)
 
 
-def _by_scans(drive: Drive) -> bool:
+def _needs_odometry(drive: Drive) -> bool:
     return choose_recorded_source(drive.motion.poses is not None) == "kiss_icp"
 
 
-def _here(drive: Drive, choice: DetectorChoice | None,
-          first: int) -> Callable[[int], Look | None]:
+def _make_surveyor(drive: Drive, choice: DetectorChoice | None,
+                   first: int) -> Callable[[int], FrameSurvey | None]:
     detector = None if choice is None else choice.open(
-        sensor_height=drive.frames[0].sensor_height, min_score=LEAST_SCORE)
-    odometry = Odometry() if _by_scans(drive) else None
+        sensor_height=drive.frames[0].sensor_height, min_score=MIN_DETECTION_SCORE)
+    odometry = Odometry() if _needs_odometry(drive) else None
 
-    def look(i: int) -> Look | None:
+    def survey(i: int) -> FrameSurvey | None:
         if i >= first:
-            return look_at(drive.frames[i], detector, odometry)
+            return survey_frame(drive.frames[i], detector, odometry)
         if odometry is not None:
             odometry(drive.frames[i].load().xyz)
         return None
-    return look
+    return survey
 
 
-def _elsewhere(reopen: Callable[[], Recording], choice: DetectorChoice | None, sequence: str,
-               first: int) -> Callable[[int], Look | None]:
+def _make_process_surveyor(reopen: Callable[[], Recording], choice: DetectorChoice | None,
+                           sequence: str, first: int) -> Callable[[int], FrameSurvey | None]:
     os.nice(10)  # the page comes first
-    return _here(one_drive(reopen(), sequence), choice, first)
+    return _make_surveyor(select_drive(reopen(), sequence), choice, first)

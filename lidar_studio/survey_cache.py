@@ -1,5 +1,4 @@
-"""The survey of a drive in files, a piece each, so that a server that is started again has it at
-once, or goes on where the other one ended."""
+"""Cache of a drive's survey on disk, so that a restarted server can use it or continue it."""
 
 from __future__ import annotations
 
@@ -20,95 +19,92 @@ from lidar_perception.runs.files import shorten_error, write_bytes
 from lidar_perception.runs.resuming import find_differences
 from lidar_perception.types import Detections, InputError
 from lidar_studio.drive import Drive
-from lidar_studio.survey import Look
+from lidar_studio.survey import FrameSurvey
 
 Array = np.ndarray[Any, Any]
 FOLDER, LAYOUT = "survey", 2
-PIECE = 20                # frames of a file
-MOST_BYTES = 300 * 10**6  # of all; the looks of 1,000 frames take a tenth of it
+FRAMES_PER_FILE = 20
+MAX_BYTES = 300 * 10**6  # all files; 1,000 frames take a tenth of it
 PARTS = "detections", "classes", "scores", "boxes", "images", "features", "things"
 
 
-def key_of(drive: Drive, choice: DetectorChoice | None) -> str:
-    """Return what a survey depends on: the drive, the detector with its weights and parameters,
-    and the version of the package."""
+def make_key(drive: Drive, choice: DetectorChoice | None) -> str:
+    """Return a JSON string of everything that a survey depends on: the drive, the detector with its
+    weights and parameters, and the version of the package."""
     weights = "" if choice is None else choice.weights
     file = Path(weights)
-    asked = {} if choice is None else {
+    parameters = {} if choice is None else {
         **({} if choice.range == "auto" else {"range": choice.range}), **choice.settings}
     content = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
-    return json.dumps({**drive.known_by, "layout": LAYOUT,
+    return json.dumps({**drive.journal_header, "layout": LAYOUT,
                        "weights": weights, "content": content[:16], "version": __version__,
-                       **({"settings": asked} if asked else {}),
+                       **({"settings": parameters} if parameters else {}),
                        "posed": drive.motion.poses is not None})
 
 
 def clear(folder: Path) -> None:
-    """Remove all pieces."""
+    """Remove all files of the cache."""
     for path in folder.glob("*.npz"):
         path.unlink(missing_ok=True)
 
 
-def write(folder: Path, key: str, first: int, looks: Sequence[Look]) -> None:
-    """Keep a piece, the looks of a drive's frames from `first` on, PIECE of them but at the end.
-    InputError where it cannot be written, or all are more than MOST_BYTES."""
+def write(folder: Path, key: str, first: int, surveys: Sequence[FrameSurvey]) -> None:
+    """Write one file of the cache: FRAMES_PER_FILE surveys from frame `first` on, fewer at the end
+    of the drive. InputError if it cannot be written or the cache is too large."""
     columns: list[list[Array]] = [[] for _ in PARTS]
-    names = sorted({name for look in looks for name in look.features})
-    for look in looks:
-        found = look.detections
-        features = np.array([look.features.get(n, np.zeros(len(look.boxes))) for n in names])
+    names = sorted({name for survey in surveys for name in survey.features})
+    for survey in surveys:
+        found = survey.detections
+        features = np.array([survey.features.get(n, np.zeros(len(survey.boxes))) for n in names])
         for column, part in zip(columns, (
-                found.boxes, found.class_ids, found.scores, look.boxes, look.images,
-                features.reshape(len(names), -1).T, look.things)):
+                found.boxes, found.class_ids, found.scores, survey.boxes, survey.images,
+                features.reshape(len(names), -1).T, survey.shapes)):
             column.append(part)
     arrays: dict[str, Any] = {}
     for name, column in zip(PARTS, columns):
         arrays[name] = np.concatenate(column)
         arrays[f"{name}_counts"] = np.array([len(part) for part in column])
-    poses = [look.pose for look in looks if look.pose is not None]
+    poses = [survey.pose for survey in surveys if survey.pose is not None]
     content = io.BytesIO()
     np.savez_compressed(content, key=np.array(key), names=np.array(names, str),
                         poses=np.array(poses), **arrays)
     size = content.getbuffer().nbytes + sum(p.stat().st_size for p in folder.glob("*.npz"))
-    if size > MOST_BYTES:
-        raise InputError(f"what is seen has more than {MOST_BYTES / 1e6:.0f} MB, and is kept up to "
-                         f"frame {first} only")
-    write_bytes(folder / _named(first), content.getbuffer())
+    if size > MAX_BYTES:
+        raise InputError(f"the survey is larger than {MAX_BYTES / 1e6:.0f} MB; only frames before "
+                         f"{first} are cached")
+    write_bytes(folder / _file_name(first), content.getbuffer())
 
 
-def _named(first: int) -> str:
+def _file_name(first: int) -> str:
     return f"{first:06}.npz"
 
 
-def read(folder: Path, key: str) -> tuple[list[Look], str]:
-    """The looks that were kept, from the first frame on, and why they are not all of those that
-    are there, or ""."""
-    looks: list[Look] = []
+def read(folder: Path, key: str) -> tuple[list[FrameSurvey], str]:
+    """Return the cached surveys from the first frame on, and why files were ignored, or ""."""
+    surveys: list[FrameSurvey] = []
     first = 0
-    while (path := folder / _named(first)).is_file():
+    while (path := folder / _file_name(first)).is_file():
         try:
             with np.load(path) as file:
                 found = str(file["key"])
-                looks += _looks(file) if found == key else []
+                surveys += _read_file(file) if found == key else []
             if found != key:
                 other = "; ".join(find_differences(json.loads(found), json.loads(key)))
-                return [], (f"{folder} is of something else ({other}); the drive is looked at "
+                return [], (f"{folder} belongs to another survey ({other}); the drive is surveyed "
                             "again")
         except (OSError, ValueError, TypeError, KeyError, AttributeError, EOFError, BadZipFile,
                 zlib.error) as error:
-            return looks, (f"{path} is damaged ({shorten_error(error)}); the drive is looked at "
-                           f"again from frame {first} on")
-        first += PIECE
-    return looks, ""
+            return surveys, (f"{path} is damaged ({shorten_error(error)}); the drive is surveyed "
+                             f"again from frame {first} on")
+        first += FRAMES_PER_FILE
+    return surveys, ""
 
 
-def _looks(file: Any) -> list[Look]:
-    """Of a piece."""
+def _read_file(file: Any) -> list[FrameSurvey]:
     names, poses = [str(name) for name in file["names"]], file["poses"]
     parts = [np.split(file[name], np.cumsum(file[f"{name}_counts"])[:-1]) for name in PARTS]
-    return [Look(Detections(boxes, classes, scores), clusters, images,
-                 dict(zip(names, features.T)) if len(clusters) else {}, things,
-                 poses[i] if len(poses) else None)
-            for i, (boxes, classes, scores, clusters, images, features, things)
+    return [FrameSurvey(Detections(boxes, classes, scores), clusters, images,
+                        dict(zip(names, features.T)) if len(clusters) else {}, shapes,
+                        poses[i] if len(poses) else None)
+            for i, (boxes, classes, scores, clusters, images, features, shapes)
             in enumerate(zip(*parts, strict=True))]
-

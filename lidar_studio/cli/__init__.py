@@ -1,4 +1,4 @@
-"""The verbs `label` and `view` of the lidar-perception command."""
+"""The `label` and `view` verbs of the lidar-perception command."""
 
 from importlib.util import find_spec
 

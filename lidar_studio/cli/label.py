@@ -1,4 +1,4 @@
-"""label: a drive's labels, made by a person on a page in the browser."""
+"""The label verb: serves the page on which a person labels a drive."""
 
 from __future__ import annotations
 
@@ -32,30 +32,30 @@ if TYPE_CHECKING:
 
 @click.command(cls=Command)
 @data_argument()
-@click.option("--sequence", metavar="NAME", help="The drive of DATA to label, where it has "
+@click.option("--sequence", metavar="NAME", help="The drive of DATA to label, if it has "
               "several.")
-@out_folder("Folder of the journal; one that is there is continued. Default: out/label/NAME OF THE "
+@out_folder("Folder of the journal; an existing one is continued. Default: out/label/NAME OF THE "
             "DRIVE.")
 @port_option
 @browser_option
 @detector_options()
-@click.option("--propose/--no-propose", default=True, help="Look for proposals in the whole drive "
-              "at once, unless the journal has some.  [default: propose]")
-@click.option("--show-labels", is_flag=True, help="Show the labels that the drive has.")
+@click.option("--propose/--no-propose", default=True, help="Propose tracks for the whole drive "
+              "at the start, unless the journal has proposals.  [default: propose]")
+@click.option("--show-labels", is_flag=True, help="Show the existing labels of the drive.")
 @click.option("--import", "imports", multiple=True, metavar="FORMAT:PATH",
-              help="Take the labels at PATH, before the page is served.")
+              help="Import the labels at PATH before the page is served.")
 @click.option("--export", "exports", metavar="FORMAT:PATH", help="Write the accepted tracks of the "
-              "journal to PATH, and end.")
-@click.option("--force", is_flag=True, help="With --export: replace what is there.")
-@click.option("--simulate-annotator", is_flag=True, help="Let a script that knows the labels do "
-              "the work, in each drive of DATA, and count its clicks, keys and drags.")
+              "journal to PATH and exit.")
+@click.option("--force", is_flag=True, help="With --export: replace existing files.")
+@click.option("--simulate-annotator", is_flag=True, help="Let a script that knows the ground truth "
+              "label each drive of DATA, and count its clicks, keys and drags.")
 @json_option
 def label(data: Path, sequence: str | None, out: Path | None, detector: DetectorChoice,
           imports: tuple[str, ...], exports: str | None, force: bool,
           simulate_annotator: bool, json_file: Path | None, **page: Any) -> None:
     """Label a drive on a page in the browser: click, accept, correct.
 
-    Every action is saved at once to FOLDER/journal.jsonl; ctrl-C ends.
+    Every action is saved to FOLDER/journal.jsonl immediately; Ctrl-C stops the server.
 
     \b
     Examples:
@@ -63,105 +63,106 @@ def label(data: Path, sequence: str | None, out: Path | None, detector: Detector
       lidar-perception label drive --out labels --no-open --port 8080
       lidar-perception label drive --export kitti-tracking:labels
     """
-    from lidar_studio.drive import one_drive, require_clouds
-    from lidar_studio.journal import NAME as JOURNAL
-    from lidar_studio.session import ImportedAlready, session
+    from lidar_studio.drive import require_clouds, select_drive
+    from lidar_studio.journal import JOURNAL_NAME
+    from lidar_studio.session import AlreadyImportedError, open_session
 
-    pairs = [_format_and_path("--import", each) for each in imports]
-    target = None if exports is None else _format_and_path("--export", exports)
+    sources = [_split_format_and_path("--import", text) for text in imports]
+    target = None if exports is None else _split_format_and_path("--export", exports)
     recording = opened(data)
     if simulate_annotator:
-        write_json(json_file, _simulated(recording, sequence, detector))
+        write_json(json_file, _simulate_annotator(recording, sequence, detector))
         return
     with show_scanning(data):
-        drive = one_drive(recording, sequence)
+        drive = select_drive(recording, sequence)
     if target is None:
         require_clouds(drive)
     folder = out or Path("out/label") / drive.name
-    if target is not None and not imports and not (folder / JOURNAL).is_file():
+    if target is not None and not imports and not (folder / JOURNAL_NAME).is_file():
         raise InputError(f"there is no journal in {folder}; give its folder with --out")
-    with session(drive, folder, detector) as made:
-        if made.journal.message:
-            errors.print(made.journal.message, style="yellow")
-        for named, path in pairs:
+    with open_session(drive, folder, detector) as session:
+        if session.journal.message:
+            errors.print(session.journal.message, style="yellow")
+        for format_name, path in sources:
             try:
-                made.do({"do": "import", "format": named, "path": path})
-            except ImportedAlready as error:  # the same command, another day
+                session.do({"do": "import", "format": format_name, "path": path})
+            except AlreadyImportedError as error:  # the same command was run before
                 errors.print(str(error), style="yellow")
         if target is not None:
-            written = made.export(target[0], os.path.abspath(target[1]), force)
+            written = session.export(target[0], os.path.abspath(target[1]), force)
             console.print(f"{written['path']}: {written['boxes']} boxes in {written['frames']} "
                           "frames")
-            for each in written["left_out"]:
-                errors.print(f"left out: {each}", style="yellow")
+            for text in written["left_out"]:
+                errors.print(f"left out: {text}", style="yellow")
         else:
-            _serve(drive, made, **page)
+            _serve(drive, session, **page)
 
 
-def _format_and_path(option: str, text: str) -> tuple[str, str]:
+def _split_format_and_path(option: str, text: str) -> tuple[str, str]:
     """Split FORMAT:PATH. InputError for an unknown format, UsageError without a path."""
     from lidar_perception.labels.exchange import FORMATS, READERS
     from lidar_perception.labels.names import resolve_format
-    named, _, path = text.partition(":")
+    format_name, _, path = text.partition(":")
     if not path:
         raise click.UsageError(f"{option} {text} must be FORMAT:PATH, such as "
                                "openlabel:labels.json")
-    return resolve_format(named, READERS if option == "--import" else FORMATS), path
+    return resolve_format(format_name, READERS if option == "--import" else FORMATS), path
 
 
-def _serve(drive: Drive, made: Session, port: int, browser: bool, propose: bool,
+def _serve(drive: Drive, session: Session, port: int, browser: bool, propose: bool,
            show_labels: bool) -> None:
     import asyncio
     import webbrowser
 
+    from lidar_studio.page_content import PageContent
     from lidar_studio.results import Results
-    from lidar_studio.served import Served
     from lidar_studio.server import serve
 
-    known = made.state.seq  # a journal begun in another folder is not seen here
+    count = session.state.seq
 
     def started(url: str) -> None:
         console.print(url)
-        how = f"goes on after {known} actions" if known else "is new"
-        errors.print(f"the journal {made.journal.path.absolute()} {how}; ctrl-C ends", style="dim")
+        state = f"continues after {count} actions" if count else "is new"
+        errors.print(f"the journal {session.journal.path.absolute()} {state}; Ctrl-C stops the "
+                     "server", style="dim")
         if propose:
-            made.prepare()
+            session.start_proposals()
         if browser:
             webbrowser.open(url)
-    layers = Results().layers_of(drive) if show_labels else None
-    asyncio.run(serve(Served(drive, made, layers), port, started))
+    layers = Results().bind_layers(drive) if show_labels else None
+    asyncio.run(serve(PageContent(drive, session, layers), port, started))
 
 
-def _simulated(recording: Recording, sequence: str | None,
-               detector: DetectorChoice) -> dict[str, Any]:
+def _simulate_annotator(recording: Recording, sequence: str | None,
+                        detector: DetectorChoice) -> dict[str, Any]:
     from lidar_perception.data.frame import BOXES
-    from lidar_studio.annotator import Annotator, totals
-    from lidar_studio.drive import one_drive
-    from lidar_studio.session import session
+    from lidar_studio.annotator import Annotator, sum_results
+    from lidar_studio.drive import select_drive
+    from lidar_studio.session import open_session
 
     recording.require(BOXES, "label --simulate-annotator")
     found: dict[str, Any] = {}
     with show_scanning(recording.path):
         names = dict.fromkeys(frame.sequence for frame in recording)
     for name in names if sequence is None else [sequence]:
-        drive = one_drive(recording, name)
+        drive = select_drive(recording, name)
         with (tempfile.TemporaryDirectory() as folder,
-              session(drive, Path(folder), detector) as made):
-            _propose(drive, made)
-            found[drive.name] = done = Annotator(made).work()
+              open_session(drive, Path(folder), detector) as session):
+            _propose_with_progress(drive, session)
+            found[drive.name] = done = Annotator(session).run()
         console.print(f"{drive.name}: {done['people']} pedestrians, {done['boxes']} boxes: "
                       f"{done['actions']} actions, {done['looked_at']} proposals looked at; by "
                       f"hand {done['by_hand']}, without tracks {done['without_tracks']}")
     if not any(done["boxes"] for done in found.values()):
-        raise InputError(f"{recording.path} has no labelled pedestrian; give another drive")
-    sums = totals(found)
+        raise InputError(f"{recording.path} has no labelled pedestrians; give another drive")
+    sums = sum_results(found)
     console.print(f"all: {sums['actions']} actions, {sums['share_of_by_hand']:.0%} of those by "
-                  f"hand; {sums['share_corrected_in_full']:.0%} where a box is put right in size "
-                  f"and heading too; without tracks {sums['share_without_tracks']:.0%}")
+                  f"hand; {sums['share_corrected_in_full']:.0%} if size and heading are corrected "
+                  f"too; without tracks {sums['share_without_tracks']:.0%}")
     return {"data": str(recording.path), "drives": found, "all": sums}
 
 
-def _propose(drive: Drive, made: Session) -> None:
+def _propose_with_progress(drive: Drive, session: Session) -> None:
     with make_progress() as bar:
-        task = bar.add_task(f"{drive.name}: looking for proposals", total=len(drive.frames))
-        made.propose(told=lambda count: bar.update(task, completed=count))
+        task = bar.add_task(f"{drive.name}: proposing tracks", total=len(drive.frames))
+        session.propose(on_progress=lambda count: bar.update(task, completed=count))

@@ -43,7 +43,7 @@ from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker,
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import Detections
 from lidar_perception.wire.topics import POINTS, TRUTH
-from lidar_studio.results import points_topic, recorded
+from lidar_studio.results import choose_points_topic, read_recorded_results
 from msg_utils.detections import from_detection_array
 
 ALL = "kitti,json,csv,mcap,openlabel"
@@ -126,8 +126,8 @@ def test_all_formats_of_one_run_hold_the_same_boxes(drives, tmp_path, monkeypatc
 
 def seen_by_view(path):
     """A bag as `view` opens it: the recording and its results."""
-    recording = open_recording(path, points=points_topic(path))
-    return recording, recorded(recording.frames.poses,
+    recording = open_recording(path, points=choose_points_topic(path))
+    return recording, read_recorded_results(recording.frames.poses,
                                [frame.stamp_ns for frame in recording.frames[:]])
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.types import InputError
-from lidar_studio.actions import DO, apply
+from lidar_studio.actions import HANDLERS, apply, decode_action, encode_action
 from lidar_studio.interpolation import Motion
 from lidar_studio.state import (
     KEY,
@@ -22,7 +22,7 @@ from lidar_studio.state import (
     Box,
     State,
     Track,
-    next_uncertain,
+    find_next_uncertain,
     track_from_json,
     track_to_json,
 )
@@ -109,7 +109,7 @@ def test_the_lines_replayed_give_the_same_state(actions, motion):
 def test_undo_and_redo_are_inverses_without_end(actions, motion):
     end, _ = done(actions, motion)
     seen, state = [labels(end)], end
-    while state.done is not None:
+    while state.undo_stack is not None:
         state, _ = apply(state, {"do": "undo"}, motion)
         seen.append(labels(state))
     assert labels(state) == labels(State())
@@ -189,8 +189,8 @@ def test_a_correction_moves_the_whole_track_that_nobody_has_touched(shift, turn,
     true = walking((5.0, 3.0), (1.0, 0.5), motion, PROPOSED)
     off = {}
     for f, box in true.items():
-        wrong = motion.fixed(box.values, f) + [*shift, 0.1, 0.2, -0.1, 0.3, turn]
-        off[f] = Box.of(motion.seen(wrong, f), PROPOSED)
+        wrong = motion.to_fixed(box.values, f) + [*shift, 0.1, 0.2, -0.1, 0.3, turn]
+        off[f] = Box.of(motion.to_sensor(wrong, f), PROPOSED)
     state = State({1: Track(1, "Pedestrian", boxes=off)}, next_id=2)
     after, _ = apply(state, {"do": "box", "track": 1, "frame": frame,
                              "box": list(true[frame].values)}, motion)
@@ -265,7 +265,8 @@ def test_copying_there_and_back_is_the_identity_and_a_copy_stands_still_in_the_w
                      {"do": "copy", "track": 1, "from": 6, "to": 1}], DRIVING)
     found = state.tracks[1].boxes
     assert close(found[1].values, box)
-    assert all(close(DRIVING.fixed(b.values, f), DRIVING.fixed(box, 1)) for f, b in found.items())
+    assert all(close(DRIVING.to_fixed(b.values, f), DRIVING.to_fixed(box, 1))
+               for f, b in found.items())
 
 
 def test_the_next_uncertain_one_goes_round():
@@ -273,9 +274,9 @@ def test_the_next_uncertain_one_goes_round():
         return Track(number, "Car", score=score, boxes={0: Box((9.0,) * 7, PROPOSED)}, **more)
     state = State({t.id: t for t in (track(1, 0.9), track(2, 0.45), track(3, 0.55),
                                      track(4, 0.5, state="accepted"))})
-    seen = [next_uncertain(state, after).id for after in (None, 2, 3, 1, 4)]
+    seen = [find_next_uncertain(state, after).id for after in (None, 2, 3, 1, 4)]
     assert seen == [2, 3, 1, 2, 2]
-    assert next_uncertain(State()) is None
+    assert find_next_uncertain(State()) is None
 
 
 def test_the_rest_of_a_class_is_rejected_at_once_and_comes_back_at_once():
@@ -285,7 +286,7 @@ def test_the_rest_of_a_class_is_rejected_at_once_and_comes_back_at_once():
                                      track(4, "Car", state="accepted"))})
     cars, _ = apply(state, {"do": "reject_rest", "class": "Car"}, STANDING)
     assert [t.state for t in cars.tracks.values()] == ["rejected", "proposed", "rejected",
-                                                      "accepted"]
+                                                       "accepted"]
     every, _ = apply(cars, {"do": "reject_rest"}, STANDING)
     assert every.tracks[2].state == "rejected" and every.tracks[4].state == "accepted"
     with pytest.raises(InputError, match="left to reject"):
@@ -298,13 +299,14 @@ def test_the_rest_of_a_class_is_rejected_at_once_and_comes_back_at_once():
 def test_what_joins_the_last_action_is_undone_with_it(before, action):
     state, _ = done([*before, {"do": "add", "frame": 1, "box": [5, 0, 0, *SIZE, 0],
                                "class": "Van"}], DRIVING)
-    below = state.done[1]
+    below = state.undo_stack[1]
     rest = {"do": "propose", "joins": True, "removed": [state.next_id - 1], "tracks": [
-        track_to_json(Track(state.next_id, "Car", boxes={2: Box((9.0,) * 7, PROPOSED)}))]}
+        Track(state.next_id, "Car", boxes={2: Box((9.0,) * 7, PROPOSED)})]}
+    assert decode_action(json.loads(json.dumps(encode_action(rest)))) == rest
     both, _ = apply(state, rest, DRIVING)
     back, _ = apply(both, {"do": "undo"}, DRIVING)
     undone, _ = apply(state, {"do": "undo"}, DRIVING)
-    assert labels(back) == labels(undone) and back.done == below
+    assert labels(back) == labels(undone) and back.undo_stack == below
     again, _ = apply(back, {"do": "redo"}, DRIVING)
     assert labels(again) == labels(both)
 
@@ -313,4 +315,4 @@ def test_every_action_is_tried():
     tried = {"seed", "propose", "import"}  # with what is computed for them: test_label_server.py
     named = {"add", "box", "snap", "size", "remove_box", "split", "interpolate", "copy", "merge",
              "accept", "reject", "reject_rest", "trim", "reopen", "class", "check"}
-    assert tried | named == DO.keys()
+    assert tried | named == HANDLERS.keys()

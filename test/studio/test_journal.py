@@ -11,9 +11,9 @@ import sys
 import pytest
 
 from lidar_perception.types import InputError
-from lidar_studio.journal import NAME, Journal, header, opened
+from lidar_studio.journal import JOURNAL_NAME, Journal, make_journal_header, open_journal
 
-HEAD = header("drive", ["a", "b c"], [1, 2])
+HEAD = make_journal_header("drive", ["a", "b c"], [1, 2])
 
 
 def lines(count):
@@ -23,39 +23,39 @@ def lines(count):
 
 def filled(folder, count):
     """A journal with so many actions; its bytes."""
-    with opened(folder, HEAD) as journal:
+    with open_journal(folder, HEAD) as journal:
         for line in lines(count):
             journal.append(line)
-    return (folder / NAME).read_bytes()
+    return (folder / JOURNAL_NAME).read_bytes()
 
 
 def test_what_was_appended_is_there(tmp_path):
     content = filled(tmp_path, 3)
-    with opened(tmp_path, HEAD) as journal:
+    with open_journal(tmp_path, HEAD) as journal:
         assert journal.lines == lines(3) and journal.message is None
-    assert (tmp_path / NAME).read_bytes() == content
+    assert (tmp_path / JOURNAL_NAME).read_bytes() == content
 
 
 def test_a_torn_last_line_is_cut_off_wherever_it_ends(tmp_path):
     content = filled(tmp_path, 2)
     first = content.index(b"\n") + 1
     for size in range(len(content)):
-        (tmp_path / NAME).write_bytes(content[:size])
-        with opened(tmp_path, HEAD) as journal:
+        (tmp_path / JOURNAL_NAME).write_bytes(content[:size])
+        with open_journal(tmp_path, HEAD) as journal:
             whole = content[:size].count(b"\n")
             assert journal.lines == lines(2)[:max(whole - 1, 0)]
             torn = size not in (0, first) and content[size - 1:size] != b"\n"
             assert (journal.message is not None) == torn
             journal.append({"seq": len(journal.lines) + 1, "do": "undo"})
-        with opened(tmp_path, HEAD) as journal:
+        with open_journal(tmp_path, HEAD) as journal:
             assert journal.lines[-1]["do"] == "undo" and journal.message is None
 
 
 WRITER = """
 import sys
 from pathlib import Path
-from lidar_studio.journal import header, opened
-with opened(Path(sys.argv[1]), header("drive", ["a", "b c"], [1, 2])) as journal:
+from lidar_studio.journal import make_journal_header, open_journal
+with open_journal(Path(sys.argv[1]), make_journal_header("drive", ["a", "b c"], [1, 2])) as journal:
     for i in range(1, 10**9):
         journal.append({"seq": i, "do": "check", "frame": i, "checked": True, "pad": "x" * 5000})
         print(i, flush=True)
@@ -72,7 +72,7 @@ def test_a_kill_in_the_middle_of_writing_loses_nothing_that_was_said_to_be_done(
                 last = int(text)
                 if last == stop:
                     process.send_signal(signal.SIGKILL)
-        with opened(folder, HEAD) as journal:
+        with open_journal(folder, HEAD) as journal:
             assert len(journal.lines) >= last >= stop
             assert [line["seq"] for line in journal.lines] == list(range(
                 1, len(journal.lines) + 1))
@@ -82,46 +82,47 @@ def test_a_second_process_is_refused_and_a_killed_one_holds_nothing(tmp_path):
     with subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], text=True,
                           stdout=subprocess.PIPE) as process:
         process.stdout.readline()
-        with pytest.raises(InputError, match="another process"), opened(tmp_path, HEAD):
+        with pytest.raises(InputError, match="another process"), open_journal(tmp_path, HEAD):
             pass
         process.kill()
         process.stdout.read()
-    with opened(tmp_path, HEAD) as journal:
+    with open_journal(tmp_path, HEAD) as journal:
         assert journal.lines
 
 
 @pytest.mark.parametrize("other", [
-    header("other", ["a", "b c"], [1, 2]), header("drive", ["a"], [1]),
-    header("drive", ["a", "b"], [1, 2]), header("drive", ["a", "b c"], [1, 3])])
+    make_journal_header("other", ["a", "b c"], [1, 2]), make_journal_header("drive", ["a"], [1]),
+    make_journal_header("drive", ["a", "b"], [1, 2]),
+    make_journal_header("drive", ["a", "b c"], [1, 3])])
 def test_the_journal_of_another_drive_is_refused_and_stays(tmp_path, other):
     content = filled(tmp_path, 2)
-    with pytest.raises(InputError, match="another drive"), opened(tmp_path, other):
+    with pytest.raises(InputError, match="another drive"), open_journal(tmp_path, other):
         pass
-    assert (tmp_path / NAME).read_bytes() == content
+    assert (tmp_path / JOURNAL_NAME).read_bytes() == content
 
 
 @pytest.mark.parametrize("broken", [b"\x00\x01", b"[1]\n", b"{}\n", b"no journal"])
 def test_what_is_no_journal_is_refused_and_stays(tmp_path, broken):
-    (tmp_path / NAME).write_bytes(broken)
-    with pytest.raises(InputError), opened(tmp_path, HEAD):
+    (tmp_path / JOURNAL_NAME).write_bytes(broken)
+    with pytest.raises(InputError), open_journal(tmp_path, HEAD):
         pass
-    assert (tmp_path / NAME).read_bytes() == broken
+    assert (tmp_path / JOURNAL_NAME).read_bytes() == broken
 
 
 def test_a_line_that_is_missing_or_broken_within_is_refused(tmp_path):
     content = filled(tmp_path, 3).splitlines(keepends=True)
     for wrong in (content[:2] + content[3:], [*content[:2], b"{\n", *content[3:]]):
-        (tmp_path / NAME).write_bytes(b"".join(wrong))
-        with pytest.raises(InputError), opened(tmp_path, HEAD):
+        (tmp_path / JOURNAL_NAME).write_bytes(b"".join(wrong))
+        with pytest.raises(InputError), open_journal(tmp_path, HEAD):
             pass
 
 
 FULL = """
 import json, resource, sys
 from pathlib import Path
-from lidar_studio.journal import header, opened
+from lidar_studio.journal import make_journal_header, open_journal
 from lidar_perception.types import InputError
-with opened(Path(sys.argv[1]), header("drive", ["a", "b c"], [1, 2])) as journal:
+with open_journal(Path(sys.argv[1]), make_journal_header("drive", ["a", "b c"], [1, 2])) as journal:
     resource.setrlimit(resource.RLIMIT_FSIZE, (3000, resource.RLIM_INFINITY))
     done = 0
     try:
@@ -140,34 +141,35 @@ def test_a_full_disk_is_said_and_the_journal_goes_on_when_there_is_room(tmp_path
                             capture_output=True)
     done, _, said = result.stdout.partition(" ")
     assert "nothing was done" in said and int(done) > 3
-    with opened(tmp_path, HEAD) as journal:
+    with open_journal(tmp_path, HEAD) as journal:
         assert len(journal.lines) == int(done) + 1 and journal.message is None
         assert journal.lines[-1]["do"] == "redo"
 
 
 @pytest.mark.parametrize("replaced", [False, True])
 def test_a_journal_that_was_removed_while_it_is_open_takes_no_more(tmp_path, replaced):
-    with opened(tmp_path, HEAD) as journal:
+    with open_journal(tmp_path, HEAD) as journal:
         journal.append(lines(1)[0])
-        (tmp_path / NAME).unlink()
+        (tmp_path / JOURNAL_NAME).unlink()
         if replaced:
-            (tmp_path / NAME).write_text("other")
+            (tmp_path / JOURNAL_NAME).write_text("other")
         with pytest.raises(InputError, match="removed or replaced"):
             journal.append(lines(2)[1])
-    assert not replaced or (tmp_path / NAME).read_text() == "other"
+    assert not replaced or (tmp_path / JOURNAL_NAME).read_text() == "other"
 
 
 def test_a_folder_that_cannot_be_written_is_said(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="is a file"), opened(tmp_path / "file", HEAD):
+    with pytest.raises(InputError, match="is a file"), open_journal(tmp_path / "file", HEAD):
         pass
-    (tmp_path / NAME).mkdir()
+    (tmp_path / JOURNAL_NAME).mkdir()
     with pytest.raises(InputError, match="cannot open"):
         Journal(tmp_path, HEAD)
 
 
 def test_numbers_that_json_has_not_are_not_written(tmp_path):
-    with opened(tmp_path, HEAD) as journal, pytest.raises(ValueError):
+    with open_journal(tmp_path, HEAD) as journal, pytest.raises(ValueError):
         journal.append({"seq": 1, "box": float("nan")})
-    assert [json.loads(line) for line in (tmp_path / NAME).read_text().splitlines()] == [HEAD]
-    assert os.listdir(tmp_path) == [NAME]
+    content = (tmp_path / JOURNAL_NAME).read_text()
+    assert [json.loads(line) for line in content.splitlines()] == [HEAD]
+    assert os.listdir(tmp_path) == [JOURNAL_NAME]

@@ -19,10 +19,10 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
 from lidar_perception.types import InputError, PointCloud
-from lidar_studio.drive import Drive, one_drive
-from lidar_studio.journal import Journal, header
-from lidar_studio.labelled import from_labels, joined, to_labels
-from lidar_studio.session import ImportedAlready, session
+from lidar_studio.drive import Drive, select_drive
+from lidar_studio.journal import Journal, make_journal_header
+from lidar_studio.label_conversion import join_extras, to_labels, to_tracks
+from lidar_studio.session import AlreadyImportedError, open_session
 from lidar_studio.state import State, track_to_json
 
 COUNT = 6
@@ -45,21 +45,22 @@ def labelled(made, frame=0, **more):
 
 
 def test_a_journal_is_of_what_the_sensor_saw_and_not_of_the_name_of_a_folder(tmp_path):
-    with session(drive(), tmp_path) as made:
+    with open_session(drive(), tmp_path) as made:
         labelled(made)
-    with session(drive("renamed"), tmp_path) as made:
+    with open_session(drive("renamed"), tmp_path) as made:
         assert len(made.state.tracks) == 1
-    with pytest.raises(InputError, match="another drive"), session(drive(x=6.0), tmp_path):
+    with pytest.raises(InputError, match="another drive"), open_session(drive(x=6.0), tmp_path):
         pass
 
 
 def test_a_journal_of_before_is_of_the_drive_of_its_name(tmp_path):
-    old = {k: v for k, v in header("monday", [f.name for f in frames()],
-                                   [f.stamp_ns for f in frames()], "").items() if k != "clouds"}
+    old = make_journal_header("monday", [f.name for f in frames()],
+                              [f.stamp_ns for f in frames()], "")
+    del old["clouds"]
     Journal(tmp_path, old).close()
-    with session(drive(), tmp_path) as made:
+    with open_session(drive(), tmp_path) as made:
         labelled(made)
-    with pytest.raises(InputError, match="another drive"), session(drive("other"), tmp_path):
+    with pytest.raises(InputError, match="another drive"), open_session(drive("other"), tmp_path):
         pass
 
 
@@ -68,7 +69,7 @@ def test_a_journal_that_grew_meanwhile_is_not_written_over(tmp_path, monkeypatch
     def no_locks(*_):
         raise OSError(9, "Bad file descriptor")
     monkeypatch.setattr(fcntl, "flock", no_locks)
-    with session(drive(), tmp_path) as one, session(drive(), tmp_path) as two:
+    with open_session(drive(), tmp_path) as one, open_session(drive(), tmp_path) as two:
         assert "cannot be locked" in one.journal.message
         labelled(one)
         content = one.journal.path.read_bytes()
@@ -79,40 +80,40 @@ def test_a_journal_that_grew_meanwhile_is_not_written_over(tmp_path, monkeypatch
 
 
 def test_the_same_labels_are_imported_once_and_others_leave_what_was_there(tmp_path):
-    with session(drive(), tmp_path / "one") as made:
+    with open_session(drive(), tmp_path / "one") as made:
         labelled(made)
         made.export("openlabel", "labels.json")
         made.do({"do": "class", "track": 1, "class": "Cyclist"})
         made.export("openlabel", "others.json")
-    with session(drive(), tmp_path / "two") as made:
+    with open_session(drive(), tmp_path / "two") as made:
         for name in ("labels", "others"):
             asked = {"do": "import", "path": str(tmp_path / f"one/{name}.json")}
             made.do(asked)
-            with pytest.raises(ImportedAlready):
+            with pytest.raises(AlreadyImportedError):
                 made.do(asked)
         made.do({"do": "undo"})
         made.do(asked)  # what was undone can be imported again
         assert sorted(t.class_name for t in made.state.tracks.values()) == ["Cyclist", "Pedestrian"]
-    with session(drive(), tmp_path / "two") as made, pytest.raises(ImportedAlready):
+    with open_session(drive(), tmp_path / "two") as made, pytest.raises(AlreadyImportedError):
         made.do(asked)
 
 
 def test_what_imports_say_besides_boxes_is_kept_of_all_of_them():
     one = {"notes": {"0": [["DontCare", {"left": 10}]]}, "extra": {"openlabel": {"": {}}}}
     two = {"notes": {"0": [["DontCare", {"left": 20}]], "3": []}, "extra": {"kitti": {}}}
-    both = joined(joined({}, one), two)
+    both = join_extras(join_extras({}, one), two)
     assert both["notes"]["0"] == one["notes"]["0"] + two["notes"]["0"]
-    assert both["extra"].keys() == {"openlabel", "kitti"} and joined(both, one) == both
+    assert both["extra"].keys() == {"openlabel", "kitti"} and join_extras(both, one) == both
 
 
 def test_boxes_without_ids_that_were_joined_get_one(tmp_path):
-    with session(drive(), tmp_path / "one") as made:
+    with open_session(drive(), tmp_path / "one") as made:
         for frame in range(COUNT):
             labelled(made, frame)
         made.export("sustech", "boxes")
         for file in (tmp_path / "one/boxes").rglob("*.json"):
             file.write_text(file.read_text().replace("obj_id", "nobody"))
-    with session(drive(), tmp_path / "two") as made:
+    with open_session(drive(), tmp_path / "two") as made:
         made.do({"do": "import", "path": str(tmp_path / "one/boxes")})
         first, *others = sorted(made.state.tracks)
         for other in others:
@@ -122,7 +123,7 @@ def test_boxes_without_ids_that_were_joined_get_one(tmp_path):
 
 
 def test_two_exports_at_once_are_both_whole_or_refused(tmp_path):
-    with session(drive(), tmp_path) as made:
+    with open_session(drive(), tmp_path) as made:
         for frame in range(COUNT):
             labelled(made, frame)
 
@@ -141,17 +142,17 @@ def test_a_journal_is_not_replayed_with_poses_that_were_not_there(tmp_path):
     bare, posed = drive(), Drive("monday", Recording(Path("monday"), "made up", [
         replace(frame, pose=lambda: np.eye(4)) for frame in frames()]))
     for k, (now, then) in enumerate(((bare, posed), (posed, bare))):
-        with session(now, tmp_path / str(k)) as made:
+        with open_session(now, tmp_path / str(k)) as made:
             labelled(made)
-        with pytest.raises(InputError, match="poses"), session(then, tmp_path / str(k)):
+        with pytest.raises(InputError, match="poses"), open_session(then, tmp_path / str(k)):
             pass
-        with session(now, tmp_path / str(k)) as made:
+        with open_session(now, tmp_path / str(k)) as made:
             assert len(made.state.tracks) == 1
 
 
 @pytest.mark.parametrize("name", ["journal.jsonl", "./other/journal.jsonl"])
 def test_no_export_is_written_over_the_journal(tmp_path, name):
-    with session(drive(), tmp_path) as made:
+    with open_session(drive(), tmp_path) as made:
         labelled(made)
         (tmp_path / "other").symlink_to(tmp_path)
         with pytest.raises(InputError, match="is the journal"):
@@ -163,7 +164,7 @@ def test_numbers_that_are_none_are_null_in_the_journal():
     none, box = float("nan"), np.array([BOX])
     labels = DriveLabels([FrameLabels.of("000000", 10**8, box, ["Car"], [1], [0.5],
                                          [{"velocity": [none, 1.0]}], [("area", {"x": none})])])
-    tracks, kept = from_labels(labels, 1)
+    tracks, kept = to_tracks(labels, 1)
     json.dumps([track_to_json(tracks[0]), kept], allow_nan=False)
     back = to_labels(replace(State(), tracks={1: tracks[0]}, kept=kept), frames()[:1])
     assert back.frames[0].extra[0] == {"velocity": [None, 1.0]}
@@ -179,7 +180,7 @@ def test_the_command_imports_once_and_exports_no_journal_that_is_not_there(tmp_p
     nowhere = run("--out", tmp_path / "empty", *to)
     assert isinstance(nowhere.exception, InputError) and "no journal" in str(nowhere.exception)
     assert not (tmp_path / "empty").exists()
-    with session(one_drive(open_recording(tmp_path / "bag")), tmp_path / "made") as made:
+    with open_session(select_drive(open_recording(tmp_path / "bag")), tmp_path / "made") as made:
         labelled(made)
     assert run("--out", tmp_path / "made", *to).exit_code == 0
     for _ in range(2):

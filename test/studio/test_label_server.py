@@ -21,7 +21,7 @@ from labeling_pages import serving
 from samples import WALKER
 from yarl import URL
 
-from lidar_studio.server import MAX_WAITING, Server, _in_loop, _send
+from lidar_studio.server import MAX_QUEUED_EVENTS, Server, _notify_in_loop, _send_events
 
 BOX = [*WALKER[:6].tolist(), 0.3]
 ADD = {"do": "add", "frame": 0, "class": "Pedestrian", "box": BOX}
@@ -39,7 +39,7 @@ def alone(*arguments):
 
 def test_a_page_that_is_too_far_behind_is_disconnected_and_so_reloads():
     async def behind():
-        queue, sent = asyncio.Queue(MAX_WAITING), []
+        queue, sent = asyncio.Queue(MAX_QUEUED_EVENTS), []
         page = SimpleNamespace(pages={queue}, closed=False)
 
         async def send_json(event):
@@ -47,12 +47,12 @@ def test_a_page_that_is_too_far_behind_is_disconnected_and_so_reloads():
 
         async def close():
             page.closed = True
-        for event in range(MAX_WAITING + 5):
-            Server.tell(page, event)
+        for event in range(MAX_QUEUED_EVENTS + 5):
+            Server.broadcast(page, event)
         assert not page.pages
         page.send_json, page.close = send_json, close
-        await asyncio.wait_for(_send(page, queue), 10)
-        assert page.closed and sent == [*range(1, MAX_WAITING)]
+        await asyncio.wait_for(_send_events(page, queue), 10)
+        assert page.closed and sent == [*range(1, MAX_QUEUED_EVENTS)]
     asyncio.run(behind())
 
 
@@ -242,7 +242,7 @@ def test_what_is_told_to_a_server_that_has_ended_does_no_harm():
     """As by the thread that listens to a running graph, which ends a little later."""
     loop = asyncio.new_event_loop()
     loop.close()
-    _in_loop(loop, SimpleNamespace(tell=None), {})
+    _notify_in_loop(loop, SimpleNamespace(broadcast=None), {})
 
 
 @pytest.mark.no_cover

@@ -15,9 +15,9 @@ from lidar_perception.types import Detections, InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.topics import TRUTH
 from lidar_perception.wire.track_markers import make_track_markers
-from lidar_studio import live as rooms
-from lidar_studio.live import BOXES, LABELS, TRACKS, Live
-from lidar_studio.live_topics import box_topics, clouds_topic
+from lidar_studio import live_graph
+from lidar_studio.live_graph import BOXES, LABELS, TRACKS, LiveGraph
+from lidar_studio.live_topics import select_box_topics, select_cloud_topic
 from msg_utils.markers import MarkedObjects, from_marker_array
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
@@ -45,8 +45,8 @@ def boxes(stamp, frame_id="velodyne", x=5.0, ids=(3,)):
 
 @pytest.fixture
 def live():
-    made = Live("test", most_frames=5)
-    made.hear(FOUND, BOXES)
+    made = LiveGraph("test", max_frames=5)
+    made.expect_topic(FOUND, BOXES)
     made.told = []
     made.listeners.append(made.told.append)
     return made
@@ -57,17 +57,17 @@ def frames_told(live):
 
 
 def test_a_frame_waits_for_its_boxes_and_late_ones_are_told_and_counted(live, monkeypatch):
-    live.cloud(cloud(10))
-    live.boxes(FOUND, boxes(10), None)       # the first: from now on clouds wait for this topic
-    live.cloud(cloud(20))
+    live.add_cloud(cloud(10))
+    live.add_boxes(FOUND, boxes(10), None)       # the first: from now on clouds wait for this topic
+    live.add_cloud(cloud(20))
     assert frames_told(live)[-1] == 0
-    live.boxes(FOUND, boxes(20), None)
+    live.add_boxes(FOUND, boxes(20), None)
     assert frames_told(live)[-1] == 1
-    live.cloud(cloud(30))
-    monkeypatch.setattr(rooms, "PATIENCE", 0.0)
-    live.tick()
+    live.add_cloud(cloud(30))
+    monkeypatch.setattr(live_graph, "MAX_WAIT_S", 0.0)
+    live.update()
     assert frames_told(live)[-1] == 2 and live.layers(2, 0.0)["detections"] == {}
-    live.boxes(FOUND, boxes(30), None)
+    live.add_boxes(FOUND, boxes(30), None)
     assert frames_told(live)[-2:] == [2, 2]
     row, = live.layers(2, 0.0)["detections"]["fused_detector"]
     assert row[:9] == [5, 0, 0, 1, 1, 1, 0, "Car", 0.5] and row[9] == {"pillars": 0.25}
@@ -75,125 +75,125 @@ def test_a_frame_waits_for_its_boxes_and_late_ones_are_told_and_counted(live, mo
 
 
 def test_boxes_may_come_before_their_cloud_and_those_without_one_are_counted(live):
-    live.boxes(FOUND, boxes(10), None)
-    live.cloud(cloud(10))
+    live.add_boxes(FOUND, boxes(10), None)
+    live.add_cloud(cloud(10))
     assert len(live.layers(0, 0.0)["detections"]["fused_detector"]) == 1
-    for stamp in range(1000, 1000 + rooms.EARLY + 3):
-        live.boxes(FOUND, boxes(stamp), None)
+    for stamp in range(1000, 1000 + live_graph.MAX_EARLY_ARRAYS + 3):
+        live.add_boxes(FOUND, boxes(stamp), None)
     topic, = live.status()["topics"]
     assert (topic["alone"], topic["late"]) == (3, 0)
 
 
 @given(st.lists(st.integers(1, 2000), min_size=1, max_size=60), st.integers(1, 12),
        st.integers(1, 40_000))
-def test_memory_keeps_to_its_bounds_and_the_newest_frame_is_there(sizes, most, most_bytes):
-    live = Live("test", most_bytes, most)
+def test_memory_keeps_to_its_bounds_and_the_newest_frame_is_there(sizes, most, max_bytes):
+    live = LiveGraph("test", max_bytes, most)
     for stamp, size in enumerate(sizes):
-        live.cloud(cloud(stamp, size))
+        live.add_cloud(cloud(stamp, size))
         kept = [f.cloud for f in live._frames.values()]
         assert live._bytes == sum(len(c.data) for c in kept)
-        assert len(kept) == 1 or (len(kept) <= most and live._bytes <= most_bytes)
+        assert len(kept) == 1 or (len(kept) <= most and live._bytes <= max_bytes)
         assert live.end == stamp + 1 == live.first + len(kept)
-        assert len(live.clouds(stamp).xyz) == size
+        assert len(live.load_scan(stamp).xyz) == size
         assert len(live._by_stamp) == len(kept)
     if live.first:
-        with pytest.raises(InputError, match="kept no more"):
-            live.clouds(live.first - 1)
+        with pytest.raises(InputError, match="no longer stored"):
+            live.load_scan(live.first - 1)
 
 
 def test_while_a_page_has_paused_frames_stay_and_what_comes_is_counted(live):
     for stamp in range(4):
-        live.cloud(cloud(stamp))
-    live.hold(1, True)
-    live.hold(2, True)
-    live.hold(1, False)
+        live.add_cloud(cloud(stamp))
+    live.set_held(1, True)
+    live.set_held(2, True)
+    live.set_held(1, False)
     for stamp in range(4, 20):
-        live.cloud(cloud(stamp))
+        live.add_cloud(cloud(stamp))
     assert (live.first, live.end) == (0, 4) and live.status()["clouds"]["passed"] == 16
-    live.hold(2, False)
-    live.cloud(cloud(20))
+    live.set_held(2, False)
+    live.add_cloud(cloud(20))
     assert live.end == 5
 
 
 def test_a_bag_that_begins_again_is_shown_again(live):
     for stamp in (1, 2, 1, 2):
-        live.cloud(cloud(stamp))
-        live.boxes(FOUND, boxes(stamp), None)
+        live.add_cloud(cloud(stamp))
+        live.add_boxes(FOUND, boxes(stamp), None)
     assert frames_told(live) == [0, 0, 1, 2, 3]  # that of the first boxes again
     assert all(live.layers(i, 0.0)["detections"] for i in range(4))
 
 
 def test_labels_that_come_before_their_cloud_do_so_when_a_bag_begins_again_too(live):
-    live.hear("/ground_truth/detections", LABELS)
+    live.expect_topic("/ground_truth/detections", LABELS)
     for stamp in (1, 2, 1, 2):
-        live.boxes("/ground_truth/detections", boxes(stamp), None)
-        live.cloud(cloud(stamp))
+        live.add_boxes("/ground_truth/detections", boxes(stamp), None)
+        live.add_cloud(cloud(stamp))
     assert all(len(live.layers(i, 0.0)["labels"]) == 1 for i in range(4))
     assert live.status()["topics"][1]["alone"] == 0
 
 
 def test_boxes_that_tf_does_not_connect_are_said_and_broken_ones_left_out(live):
-    live.cloud(cloud(1))
-    live.boxes(FOUND, boxes(1, "base_link"), None)
+    live.add_cloud(cloud(1))
+    live.add_boxes(FOUND, boxes(1, "base_link"), None)
     line, = live.status()["lines"]
     assert FOUND in line and "TF does not connect 'base_link' with 'velodyne'" in line
     assert live.layers(0, 0.0)["detections"] == {}
     wrong = boxes(1, ids=(1, 2, 3, 4))
     wrong.boxes[0, 0], wrong.boxes[1, 4], wrong.scores[2] = np.nan, 0.0, np.inf
-    live.boxes(FOUND, wrong, None)
+    live.add_boxes(FOUND, wrong, None)
     assert len(live.layers(0, 0.0)["detections"]["fused_detector"]) == 1
     assert live.status()["lines"] == []
 
 
 def test_boxes_in_another_frame_are_those_of_the_clouds_once_tf_has_come(live, monkeypatch):
     """What is fixed and what moves between them; with trails; each at its own stamp."""
-    live.hear(TRACKED, TRACKS)
+    live.expect_topic(TRACKED, TRACKS)
     second = 10**9
     mounted, turned = [1.0, 0.5, 1.7], [0.0, 0.0, np.sin(0.2), np.cos(0.2)]  # by 0.4 rad
     trail = np.array([[5.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
     live.tree.set("base", "velodyne", 0, mounted, turned, static=True)
     live.tree.set("odom", "base", 10 * second, [0, 0, 0], [0, 0, 0, 1])
-    live.boxes(FOUND, boxes(10 * second), None)
+    live.add_boxes(FOUND, boxes(10 * second), None)
     for i, stamp in enumerate((10 * second, 10 * second + second // 2)):
-        live.cloud(cloud(stamp))
+        live.add_cloud(cloud(stamp))
         pose = make_pose(np.array([4.0 * i / 2, 0, 0]), [0, 0, 0, 1]) @ make_pose(mounted, turned)
         found = Detections.of(transform_boxes(boxes(stamp).boxes, pose), [0], [0.5])
         tracks = make_track_markers(np.array([3]), found, np.zeros((1, 2)), np.zeros(1),
                                     [transform_points(trail, pose)],
                                     make_header(stamp, "odom", bag_message), bag_message)
-        live.boxes(TRACKED, from_marker_array(tracks), tracks)
+        live.add_boxes(TRACKED, from_marker_array(tracks), tracks)
         if i:
-            live.boxes(FOUND, boxes(stamp), None)
+            live.add_boxes(FOUND, boxes(stamp), None)
     assert frames_told(live)[-1] == 0 and live.status()["lines"] == []  # the other waits for TF
     live.tree.set("odom", "base", 11 * second, [4, 0, 0], [0, 0, 0, 1])
-    live.tick()
+    live.update()
     assert frames_told(live)[-1] == 1
     track, = live.tracks()
     for row, frame in zip(track["boxes"], (0, 1), strict=True):
         np.testing.assert_allclose(row[1:8], boxes(0).boxes[0], atol=1e-6)
         np.testing.assert_allclose(track["trails"][frame], trail, atol=1e-3)
-    monkeypatch.setattr(rooms, "PATIENCE", 0.0)
-    live.cloud(cloud(11 * second + second // 2))
-    live.boxes(TRACKED, boxes(11 * second + second // 2, "odom"), None)
+    monkeypatch.setattr(live_graph, "MAX_WAIT_S", 0.0)
+    live.add_cloud(cloud(11 * second + second // 2))
+    live.add_boxes(TRACKED, boxes(11 * second + second // 2, "odom"), None)
     assert any("the newest transform" in line for line in live.status()["lines"])
-    live.boxes(FOUND, boxes(11 * second + second // 2), None)
+    live.add_boxes(FOUND, boxes(11 * second + second // 2), None)
     assert frames_told(live)[-1] == 2  # shown without
 
 
 def test_tracks_of_two_trackers_keep_apart_and_labels_say_what_is_missed(live):
-    live.hear(TRACKED, TRACKS)
-    live.hear("/b/tracker/output/tracks", TRACKS)
-    live.hear("/ground_truth/detections", LABELS)
-    live.cloud(cloud(1))
+    live.expect_topic(TRACKED, TRACKS)
+    live.expect_topic("/b/tracker/output/tracks", TRACKS)
+    live.expect_topic("/ground_truth/detections", LABELS)
+    live.add_cloud(cloud(1))
     for topic in (TRACKED, "/b/tracker/output/tracks", "/ground_truth/detections"):
-        live.boxes(topic, boxes(1), None)
-    live.boxes(FOUND, boxes(1, x=50.0), None)
+        live.add_boxes(topic, boxes(1), None)
+    live.add_boxes(FOUND, boxes(1, x=50.0), None)
     assert len({t["id"] for t in live.tracks()}) == 2
     match = live.layers(0, 0.0)["matches"]["fused_detector"]
     assert match == {"missed": [0], "false": None, "ignored_labels": [], "ignored": None}
-    live.forget(TRACKED)  # another graph takes its place
-    live.hear("/c/tracker/output/tracks", TRACKS)
-    live.boxes("/c/tracker/output/tracks", boxes(1), None)
+    live.forget_topic(TRACKED)  # another graph takes its place
+    live.expect_topic("/c/tracker/output/tracks", TRACKS)
+    live.add_boxes("/c/tracker/output/tracks", boxes(1), None)
     assert len({t["id"] for t in live.tracks()}) == 2
 
 
@@ -202,23 +202,23 @@ def test_the_cloud_with_most_columns_is_chosen_and_the_boxes_of_its_namespace():
            "/clustering/output/points": CLOUD, FOUND: MARKERS, FOUND + "_3d": ARRAY,
            TRACKED: MARKERS, "/ground_truth/detections": MARKERS,
            "/clustering/output/boxes": MARKERS}
-    assert clouds_topic(one) == "/clustering/output/points"
-    assert box_topics(one, "/clustering/output/points") == {
+    assert select_cloud_topic(one) == "/clustering/output/points"
+    assert select_box_topics(one, "/clustering/output/points") == {
         FOUND: BOXES, TRACKED: TRACKS, "/ground_truth/detections": LABELS}
-    assert box_topics({FOUND + "_3d": ARRAY}, "/points") == {FOUND + "_3d": BOXES}
-    assert box_topics(one, "/points", wanted=["clustering/output/boxes"]) == {
+    assert select_box_topics({FOUND + "_3d": ARRAY}, "/points") == {FOUND + "_3d": BOXES}
+    assert select_box_topics(one, "/points", wanted=["clustering/output/boxes"]) == {
         "/clustering/output/boxes": BOXES, TRACKED: TRACKS, "/ground_truth/detections": LABELS}
     two = {f"/{ns}{topic}": kind for ns in ("front", "rear") for topic, kind in one.items()}
     with pytest.raises(InputError, match="--namespace"):
-        clouds_topic(two)
-    chosen = clouds_topic(two, "rear")
+        select_cloud_topic(two)
+    chosen = select_cloud_topic(two, "rear")
     assert chosen == "/rear/clustering/output/points"
-    assert all(topic.startswith("/rear/") for topic in box_topics(two, chosen))
-    assert clouds_topic(two, "front", "points") == "/front/points"
-    assert clouds_topic({"/velodyne_points": CLOUD, "/x": MARKERS}) == "/velodyne_points"
+    assert all(topic.startswith("/rear/") for topic in select_box_topics(two, chosen))
+    assert select_cloud_topic(two, "front", "points") == "/front/points"
+    assert select_cloud_topic({"/velodyne_points": CLOUD, "/x": MARKERS}) == "/velodyne_points"
     for types, wanted in (({}, ""), (one, "/no"), ({"/a": CLOUD, "/b": CLOUD}, "")):
         with pytest.raises(InputError) as said:
-            clouds_topic(types, wanted=wanted)
+            select_cloud_topic(types, wanted=wanted)
         assert "\n" not in str(said.value)
 
 
@@ -228,17 +228,17 @@ def test_boxes_of_another_robot_are_not_shown_with_the_clouds_of_this_one():
     for robot in ("", "/b"):
         clouds, expected = robot + "/clustering/output/points", {
             robot + FOUND, robot + TRACKED, robot + TRUTH}
-        assert clouds_topic(both, robot or "/") == clouds
-        assert set(box_topics(both, clouds, robot or "/")) == expected
+        assert select_cloud_topic(both, robot or "/") == clouds
+        assert set(select_box_topics(both, clouds, robot or "/")) == expected
         for name in ("clustering/output/points", "a_clustering/output/points", "points",
                      "velodyne_points", "ouster/points"):
-            assert set(box_topics(both, f"{robot}/{name}")) == expected
+            assert set(select_box_topics(both, f"{robot}/{name}")) == expected
     for clouds, theirs in (("/clustering/output/points", False), ("/a/points", False),
                            ("/points", True), ("/livox/lidar", True)):
         alone = {"/b" + FOUND: MARKERS}  # of another robot, or the only one
-        assert bool(box_topics(alone, clouds)) == theirs
-        assert not box_topics(alone | {"/c" + FOUND: MARKERS}, clouds)
-    assert set(box_topics(one, "/ouster/points")) == {FOUND, TRACKED, TRUTH}
+        assert bool(select_box_topics(alone, clouds)) == theirs
+        assert not select_box_topics(alone | {"/c" + FOUND: MARKERS}, clouds)
+    assert set(select_box_topics(one, "/ouster/points")) == {FOUND, TRACKED, TRUTH}
 
 
 def test_pages_may_ask_while_topics_come_and_go(live):
@@ -253,7 +253,7 @@ def test_pages_may_ask_while_topics_come_and_go(live):
                 live.status(), live.frames(), live.tracks(), live.first
                 live.layers(live.end - 1, 0.0)
             except InputError:
-                pass  # kept no more
+                pass  # no longer stored
             except Exception as error:
                 wrong.append(error)
                 return
@@ -263,9 +263,12 @@ def test_pages_may_ask_while_topics_come_and_go(live):
     try:
         for i in range(1500):
             topic = f"/{i % 40}/output/detections"
-            (live.forget if i % 3 == 2 else live.hear)(*([topic] if i % 3 == 2 else [topic, BOXES]))
-            live.boxes(topic, boxes(i), None)
-            live.cloud(cloud(i))
+            if i % 3 == 2:
+                live.forget_topic(topic)
+            else:
+                live.expect_topic(topic, BOXES)
+            live.add_boxes(topic, boxes(i), None)
+            live.add_cloud(cloud(i))
     finally:
         over.set()
         asking.join()

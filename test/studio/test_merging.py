@@ -10,10 +10,10 @@ import pytest
 from lidar_perception.types import Detections
 from lidar_studio.actions import apply
 from lidar_studio.interpolation import Motion
-from lidar_studio.proposals import Wanted, found_in
-from lidar_studio.proposing import merged
+from lidar_studio.proposals import ProposalRequest, find_objects
+from lidar_studio.proposer import merge_proposals
 from lidar_studio.state import KEY, PROPOSED, Box, State, Track
-from lidar_studio.survey import Look
+from lidar_studio.survey import FrameSurvey
 
 MOTION = Motion.of(np.arange(8) * 10**8)
 
@@ -38,27 +38,27 @@ def test_proposals_keep_ids_and_take_nothing_from_a_person():
     state = State(old, next_id=6)
     new = [straight(5.1, 0, range(8)), straight(9.1, 0, range(8)), straight(30.1, 0, range(6)),
            straight(50, 0, range(8)), straight(40, 0.1, range(8))]
-    tracks, removed = merged(state, new, MOTION)
+    tracks, removed = merge_proposals(state, new, MOTION)
     found = {t.id: t for t in tracks}
     assert removed == [3] and found.keys() == {1, 4, 6}
     assert found[1].boxes == new[0].boxes and found[6].boxes == new[3].boxes
     assert found[4].state == "accepted" and found[4].boxes.keys() == set(range(6))
     again = State({**{n: t for n, t in old.items() if n != 3}, **found}, next_id=7)
-    assert merged(again, new, MOTION) == ([], [])
+    assert merge_proposals(again, new, MOTION) == ([], [])
 
 
 def test_an_imported_box_and_one_of_a_proposal_are_no_clicks():
     """Labels without track ids are tracks of one box each: nobody asked to follow them."""
     old = {n: with_id(straight(5, 0, [n], kind=KEY), n, state="accepted", source=source)
            for n, source in enumerate(("imported", "fused", "person"), 1)}
-    assert merged(State(old, next_id=4), [straight(5, 0, range(8))], MOTION) == ([], [])
+    assert merge_proposals(State(old, next_id=4), [straight(5, 0, range(8))], MOTION) == ([], [])
 
 
 @pytest.mark.parametrize("work", [{"do": "class", "track": 1, "class": "Cyclist"},
                                   {"do": "split", "track": 1, "frame": 4}])
 def test_proposals_leave_what_a_person_named_or_cut(work):
     state, _ = apply(State({1: with_id(straight(5, 0, range(8)), 1)}, next_id=2), work, MOTION)
-    assert merged(state, [straight(5, 0, range(8))], MOTION) == ([], [])
+    assert merge_proposals(state, [straight(5, 0, range(8))], MOTION) == ([], [])
 
 
 def test_a_click_that_ends_here_is_not_followed_beyond():
@@ -66,13 +66,13 @@ def test_a_click_that_ends_here_is_not_followed_beyond():
     near = replace(near, boxes=near.boxes | straight(5, 0, [3], kind=KEY).boxes)
     state, _ = apply(State({1: near}, next_id=2), {"do": "trim", "track": 1, "frame": 3,
                                                    "side": "after"}, MOTION)
-    (found,), _ = merged(state, [straight(5, 0, range(8))], MOTION)
+    (found,), _ = merge_proposals(state, [straight(5, 0, range(8))], MOTION)
     assert sorted(found.boxes) == [0, 1, 2, 3] and not found.nearby
 
 
 def test_two_clicks_in_one_frame_are_both_there():
-    look = Look(Detections.none(), np.zeros((0, 7)), np.zeros((0, 80), np.uint32), {},
-                np.zeros((0, 7)))
+    look = FrameSurvey(Detections.none(), np.zeros((0, 7)), np.zeros((0, 80), np.uint32), {},
+                       np.zeros((0, 7)))
     both = [(np.array([x, 0.0, -1, 0.8, 0.6, 1.7, 0]), "Pedestrian") for x in (5.0, 9.0)]
-    found, _ = found_in(look, Wanted(), both)
+    found, _ = find_objects(look, ProposalRequest(), both)
     assert found.boxes[:, 0].tolist() == [5.0, 9.0]

@@ -20,13 +20,14 @@ from lidar_perception.geometry import points_in_box
 from lidar_perception.simulation.recording import simulate_frames
 from lidar_perception.types import InputError
 from lidar_studio import survey_cache
-from lidar_studio.alike import alike
+from lidar_studio.actions import apply
 from lidar_studio.annotator import Annotator, Truth, is_right
 from lidar_studio.drive import Drive
-from lidar_studio.journal import NAME
-from lidar_studio.session import session
-from lidar_studio.snap import to_cluster, to_ground
-from lidar_studio.state import KEY, PROPOSED, Box, State
+from lidar_studio.journal import JOURNAL_NAME
+from lidar_studio.session import open_session
+from lidar_studio.size_similarity import compute_size_similarity
+from lidar_studio.snap import snap_to_cluster, snap_to_ground
+from lidar_studio.state import KEY, PROPOSED, Box, State, track_to_json
 
 SEED, FRAMES = 119, 6  # a street with people near and far
 
@@ -41,7 +42,7 @@ def drive(streets):
 @pytest.fixture
 def made(drive, tmp_path):
     """Labels of which there are none yet; no detector."""
-    with session(drive, tmp_path, detector=None) as made:
+    with open_session(drive, tmp_path, detector=None) as made:
         yield made
 
 
@@ -50,7 +51,7 @@ def person(made):
     people = Truth(made).people.values()
     boxes = min(people, key=lambda b: np.hypot(*next(iter(b.values()))[:2]))
     frame = min(boxes)
-    scan = made.drive.clouds(frame)
+    scan = made.drive.load_scan(frame)
     inside = scan.xyz[points_in_box(scan.xyz, boxes[frame]) & (scan.cluster_ids > 0)]
     return boxes, frame, inside[len(inside) // 2].tolist()
 
@@ -63,7 +64,7 @@ def click(made):
 
 
 def test_a_clicked_person_is_followed_through_the_drive(made):
-    made.propose(here=True)
+    made.propose(in_process=True)
     assert not made.state.tracks  # nothing is like nobody
     boxes, track = click(made)
     assert len(boxes) >= FRAMES - 1 and boxes.keys() <= track.boxes.keys()
@@ -81,13 +82,13 @@ def boxes_of(made):
 
 def test_a_seed_in_a_long_drive_is_answered_at_once_and_in_the_end_in_full(
         made, drive, tmp_path, monkeypatch):
-    made.propose(here=True)
+    made.propose(in_process=True)
     click(made)
     full = boxes_of(made)
-    with session(drive, tmp_path / "long", detector=None) as long:
-        long.propose(here=True)
+    with open_session(drive, tmp_path / "long", detector=None) as long:
+        long.propose(in_process=True)
         before = long.state
-        monkeypatch.setattr("lidar_studio.session.NEARBY", 1)
+        monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
         _, frame, xyz = person(long)
         answered = []
         long.listeners.append(lambda event: answered.append(event.get("tracks")))
@@ -100,10 +101,23 @@ def test_a_seed_in_a_long_drive_is_answered_at_once_and_in_the_end_in_full(
         assert long.state.tracks == before.tracks and long.state.seeds == before.seeds
 
 
+def test_seed_is_applied_once_and_its_tracks_are_encoded_once(made, monkeypatch):
+    made.propose(in_process=True)
+    applied, encoded = [], []
+    monkeypatch.setattr("lidar_studio.session.apply",
+                        lambda *args: applied.append(args) or apply(*args))
+    monkeypatch.setattr("lidar_studio.session.track_to_json",
+                        lambda track: encoded.append(track.id) or track_to_json(track))
+    monkeypatch.setattr("lidar_studio.state.track_from_json", None)
+    click(made)
+    assert len(applied) == 1
+    assert encoded and len(set(encoded)) == len(encoded)
+
+
 def test_a_car_that_is_clicked_is_a_seed_too_and_others_like_it_are_proposed(made):
-    made.propose(here=True)
+    made.propose(in_process=True)
     frame = made.drive.frames[0]
-    truth, scan = frame.truth(), made.drive.clouds(0)
+    truth, scan = frame.truth(), made.drive.load_scan(0)
     cars = truth.of_class(CAR)
     inside = [scan.xyz[points_in_box(scan.xyz, b) & (scan.cluster_ids > 0)] for b in cars]
     seen = sorted(range(len(cars)), key=lambda k: -len(inside[k]))
@@ -125,24 +139,25 @@ def test_what_is_as_large_as_the_seed_is_most_alike(length, width, height, share
     length, width = max(length, width), min(length, width)
     size = length, width, height
     same = np.array([[9.0, 0, 0, *size, 0.3]])
-    assert alike(same, size) == pytest.approx(1.0)
+    assert compute_size_similarity(same, size) == pytest.approx(1.0)
     scaled = same * [1, 1, 1, share, 1, 1, 1]
-    assert 0 <= alike(scaled, size)[0] <= 1
-    larger = [alike(same * [1, 1, 1, s, s, s, 1], size)[0] for s in (1.0, 1.1, 1.3, 1.6)]
+    assert 0 <= compute_size_similarity(scaled, size)[0] <= 1
+    larger = [compute_size_similarity(same * [1, 1, 1, s, s, s, 1], size)[0]
+              for s in (1.0, 1.1, 1.3, 1.6)]
     assert larger == sorted(larger, reverse=True) and larger[-1] < 0.1
 
 
 def frames_looked_at(drive, folder, until=FRAMES):
     """Of a session that is ended once so many frames are looked at; what it says, its labels."""
     looked_at, said = [], []
-    with session(drive, folder, detector=None) as made:
+    with open_session(drive, folder, detector=None) as made:
         made.listeners.append(lambda event: said.append(event.get("error", "")))
 
         def told(count):
             looked_at.append(count)
             if count == until < FRAMES:
                 made.cancel()
-        made.propose(here=True, told=told)
+        made.propose(in_process=True, on_progress=told)
         if until == FRAMES:
             click(made)
     return looked_at, "".join(said), boxes_of(made)
@@ -154,7 +169,7 @@ def kept_in(folder):
 
 @pytest.mark.parametrize("posed", [True, False])
 def test_a_survey_that_was_ended_goes_on_where_it_was(drive, tmp_path, monkeypatch, posed):
-    monkeypatch.setattr(survey_cache, "PIECE", 2)
+    monkeypatch.setattr(survey_cache, "FRAMES_PER_FILE", 2)
     if not posed:  # then KISS-ICP finds the poses, scan after scan
         pytest.importorskip("kiss_icp")
         frames = [replace(frame, pose=lambda: None) for frame in drive.frames]
@@ -170,27 +185,27 @@ def test_a_survey_that_was_ended_goes_on_where_it_was(drive, tmp_path, monkeypat
 
 
 def test_a_survey_of_something_else_is_begun_anew_and_that_is_said(drive, tmp_path, monkeypatch):
-    monkeypatch.setattr(survey_cache, "PIECE", 2)
+    monkeypatch.setattr(survey_cache, "FRAMES_PER_FILE", 2)
     other = Drive("simulated", Recording(Path("simulated"), "simulated", [
         replace(frame, load=drive.frames[0].load) for frame in drive.frames]))  # other clouds only
     frames_looked_at(drive, tmp_path, until=5)
-    (tmp_path / NAME).unlink()  # the journal is of the clouds, too
+    (tmp_path / JOURNAL_NAME).unlink()  # the journal is of the clouds, too
     looked_at, said, _ = frames_looked_at(other, tmp_path, until=3)
-    assert looked_at == [1, 2, 3] and "something else (clouds " in said
+    assert looked_at == [1, 2, 3] and "another survey (clouds " in said
     assert kept_in(tmp_path).keys() == {"000000.npz"}
-    (tmp_path / NAME).unlink()
+    (tmp_path / JOURNAL_NAME).unlink()
     looked_at, said, _ = frames_looked_at(drive, tmp_path)
-    assert looked_at == [1, 2, 3, 4, 5, 6] and "looked at again" in said
+    assert looked_at == [1, 2, 3, 4, 5, 6] and "surveyed again" in said
     found, why = survey_cache.read(tmp_path / survey_cache.FOLDER,
-                                   survey_cache.key_of(drive, DetectorChoice("pointpillars")))
+                                   survey_cache.make_key(drive, DetectorChoice("pointpillars")))
     assert found == [] and "weights '', not 'pointpillars'" in why
 
 
 def test_a_survey_takes_no_more_room_than_it_may(drive, tmp_path, monkeypatch):
-    monkeypatch.setattr(survey_cache, "PIECE", 2)
-    monkeypatch.setattr(survey_cache, "MOST_BYTES", 60_000)
+    monkeypatch.setattr(survey_cache, "FRAMES_PER_FILE", 2)
+    monkeypatch.setattr(survey_cache, "MAX_BYTES", 60_000)
     looked_at, said, labels = frames_looked_at(drive, tmp_path)
-    assert len(looked_at) == FRAMES and labels and "kept up to frame" in said
+    assert len(looked_at) == FRAMES and labels and "are cached" in said
     sizes = [len(content) for content in kept_in(tmp_path).values()]
     assert 0 < len(sizes) < FRAMES / 2 and sum(sizes) <= 60_000
 
@@ -199,20 +214,20 @@ def test_a_survey_takes_no_more_room_than_it_may(drive, tmp_path, monkeypatch):
 def test_a_seed_that_is_corrected_before_it_was_followed_is_followed_all_the_same(
         drive, tmp_path, monkeypatch, restarted):
     """Also if the server was killed meanwhile, by the next one."""
-    monkeypatch.setattr("lidar_studio.session.NEARBY", 1)
-    with session(drive, tmp_path, detector=None) as made:
-        made.propose(here=True)
+    monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
+    with open_session(drive, tmp_path, detector=None) as made:
+        made.propose(in_process=True)
         monkeypatch.setattr(made, "_start", lambda *_: None)  # it had no time
         _, track = click(made)
         moved = [track.boxes[1].values[0] + 0.1, *track.boxes[1].values[1:]]
         made.do({"do": "box", "track": track.id, "frame": 1, "box": moved})
         assert len(made.state.tracks[track.id].boxes) < FRAMES - 1
         if not restarted:
-            made.propose(here=True, anew=False)
+            made.propose(in_process=True, again=False)
             found = made.state.tracks[track.id]
     if restarted:
-        with session(drive, tmp_path, detector=None) as again:
-            again.prepare()
+        with open_session(drive, tmp_path, detector=None) as again:
+            again.start_proposals()
             again.wait()
             found = again.state.tracks[track.id]
     assert len(found.boxes) >= FRAMES - 1 and not found.nearby
@@ -222,8 +237,8 @@ def test_a_seed_that_is_corrected_before_it_was_followed_is_followed_all_the_sam
 
 def test_a_correction_that_is_undone_while_a_click_was_followed_leaves_it_followed(
         made, monkeypatch):
-    monkeypatch.setattr("lidar_studio.session.NEARBY", 1)
-    made.propose(here=True)
+    monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
+    made.propose(in_process=True)
     begun, start = [], made._start
     monkeypatch.setattr(made, "_start", lambda *asked: begun.append(asked))  # slowly
     _, track = click(made)
@@ -231,21 +246,21 @@ def test_a_correction_that_is_undone_while_a_click_was_followed_leaves_it_follow
         track.boxes[1].values[0] + 0.1, *track.boxes[1].values[1:]]})
     (_, work), = begun
     work()
-    followed = made.state.tracks[track.id]
-    assert len(followed.boxes) >= FRAMES - 1 and not followed.nearby
+    extend_track = made.state.tracks[track.id]
+    assert len(extend_track.boxes) >= FRAMES - 1 and not extend_track.nearby
     monkeypatch.setattr(made, "_start", start)
     for back in ("undo", "redo"):
         made.do({"do": back})
         made.wait()
         found = made.state.tracks[track.id]
-        assert found.boxes.keys() == followed.boxes.keys() and not found.nearby
+        assert found.boxes.keys() == extend_track.boxes.keys() and not found.nearby
 
 
 @pytest.mark.parametrize("verb", ["accept", "reopen"])
 def test_a_click_that_is_rejected_while_it_is_followed_is_followed_once_that_is_taken_back(
         made, monkeypatch, verb):
-    monkeypatch.setattr("lidar_studio.session.NEARBY", 1)
-    made.propose(here=True)
+    monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
+    made.propose(in_process=True)
     begun, start = [], made._start
     monkeypatch.setattr(made, "_start", lambda *asked: begun.append(asked))  # slowly
     _, track = click(made)
@@ -266,8 +281,8 @@ def test_what_was_only_looked_at_by_the_server_is_nobodys_to_undo(made):
     when they are undone."""
     made.do({"do": "check", "frame": 1})
     made.do({"do": "undo"})
-    made.propose(here=True)
-    assert not made.state.done
+    made.propose(in_process=True)
+    assert not made.state.undo_stack
     made.do({"do": "redo"})
     assert made.state.checked == {1}
     _, track = click(made)
@@ -276,12 +291,12 @@ def test_what_was_only_looked_at_by_the_server_is_nobodys_to_undo(made):
 
 
 def test_the_survey_is_kept_over_a_restart_and_made_again_where_it_is_damaged(drive, tmp_path):
-    with session(drive, tmp_path, detector=None) as made:
-        made.propose(here=True)
-    folder, key = tmp_path / survey_cache.FOLDER, survey_cache.key_of(drive, None)
-    looks, _ = survey_cache.read(folder, key)
-    for old, new in zip(made.proposer.looks, looks, strict=True):
-        for name in ("boxes", "images", "things"):
+    with open_session(drive, tmp_path, detector=None) as made:
+        made.propose(in_process=True)
+    folder, key = tmp_path / survey_cache.FOLDER, survey_cache.make_key(drive, None)
+    surveys, _ = survey_cache.read(folder, key)
+    for old, new in zip(made.proposer.surveys, surveys, strict=True):
+        for name in ("boxes", "images", "shapes"):
             assert np.array_equal(getattr(old, name), getattr(new, name))
         assert np.array_equal(old.detections.boxes, new.detections.boxes)
         assert old.features.keys() == new.features.keys()
@@ -293,14 +308,14 @@ def test_the_survey_is_kept_over_a_restart_and_made_again_where_it_is_damaged(dr
         kept.write_bytes(damaged)
         found, why = survey_cache.read(folder, key)
         assert found == [] and "damaged" in why
-    with session(drive, tmp_path, detector=None) as again:
+    with open_session(drive, tmp_path, detector=None) as again:
         said = []
         again.listeners.append(lambda event: said.append(event.get("error", "")))
-        assert again.was_proposed and again.proposer.looks is None
-        again.propose(here=True, anew=False)
-        assert any("damaged" in line for line in said) and again.proposer.looks is not None
-    with session(drive, tmp_path, detector=None) as third:
-        assert third.proposer.looks is not None
+        assert again.has_proposals and again.proposer.surveys is None
+        again.propose(in_process=True, again=False)
+        assert any("damaged" in line for line in said) and again.proposer.surveys is not None
+    with open_session(drive, tmp_path, detector=None) as third:
+        assert third.proposer.surveys is not None
         click(third)
         assert len(third.state.tracks) >= 1 and third.state.seeds
 
@@ -308,36 +323,36 @@ def test_the_survey_is_kept_over_a_restart_and_made_again_where_it_is_damaged(dr
 def test_a_person_who_was_clicked_before_the_drive_was_looked_at_is_followed_then(made):
     _, track = click(made)
     assert len(track.boxes) == 1
-    made.propose(here=True)
-    followed = made.state.tracks[track.id]
-    assert len(followed.boxes) >= FRAMES - 1 and followed.state == "accepted"
-    key, = [f for f, b in followed.boxes.items() if b.kind == KEY]
-    assert followed.boxes[key] == track.boxes[key]
+    made.propose(in_process=True)
+    extend_track = made.state.tracks[track.id]
+    assert len(extend_track.boxes) >= FRAMES - 1 and extend_track.state == "accepted"
+    key, = [f for f, b in extend_track.boxes.items() if b.kind == KEY]
+    assert extend_track.boxes[key] == track.boxes[key]
 
 
 def test_proposing_again_changes_nothing_that_was_decided(made):
-    made.propose(here=True)
+    made.propose(in_process=True)
     click(made)
     waiting = [t for t in made.state.tracks.values() if t.state == PROPOSED]
     for track in waiting[::2]:
         made.do({"do": "reject", "track": track.id})
     before = made.state.tracks
-    made.propose(here=True)
+    made.propose(in_process=True)
     assert made.state.tracks == before
 
 
 def test_the_journal_of_proposals_is_replayed_without_looking_at_the_drive(made, drive, tmp_path):
-    made.propose(here=True)
+    made.propose(in_process=True)
     click(made)
     state = made.state
     made.journal.close()
-    again = type(made)(drive, type(made.journal)(tmp_path, made.journal._head), detector=None)
-    assert again.state == state and again.was_proposed
+    again = type(made)(drive, type(made.journal)(tmp_path, made.journal._header), detector=None)
+    assert again.state == state and again.has_proposals
 
 
 def test_the_annotator_ends_with_every_person_right_and_less_work(made):
-    made.propose(here=True)
-    done = Annotator(made).work()
+    made.propose(in_process=True)
+    done = Annotator(made).run()
     truth = Truth(made)
     assert done["people"] == len(truth.people) > 0
     accepted = [t for t in made.state.tracks.values() if t.state == "accepted"]
@@ -351,11 +366,11 @@ def test_the_annotator_ends_with_every_person_right_and_less_work(made):
 def test_what_is_cancelled_while_it_waits_for_what_went_on_before_ends_at_once(made):
     done, go_on = [], threading.Event()
     made._start("first", go_on.wait)
-    made._start("second", lambda: done.append(made._done(0)))
+    made._start("second", lambda: done.append(made._report_progress(0)))
     made.cancel()
     go_on.set()
     made.wait()
-    made._start("third", lambda: done.append(made._done(0)))
+    made._start("third", lambda: done.append(made._report_progress(0)))
     made.wait()
     assert done == [False, True]
 
@@ -363,23 +378,23 @@ def test_what_is_cancelled_while_it_waits_for_what_went_on_before_ends_at_once(m
 def test_proposals_that_are_cancelled_write_nothing(made):
     made.busy = {"what": "proposing", "done": 0, "of": FRAMES}
     made.listeners.append(lambda event: made.cancel())
-    made.propose(here=True)
-    assert made.state == State() and made.proposer.looks is None
+    made.propose(in_process=True)
+    assert made.state == State() and made.proposer.surveys is None
 
 
 def test_boxes_snap_to_what_is_there(drive):
     frame = drive.frames[0]
-    truth, scan = frame.truth(), drive.clouds(0)
+    truth, scan = frame.truth(), drive.load_scan(0)
     near = np.hypot(*truth.boxes[:, :2].T) < 20  # farther away little ground is seen
     for box in truth.boxes[(truth.class_ids == 3) & near]:
         lifted = box + [0.1, -0.1, 0.3, 0, 0, 0, 0]
-        down = to_ground(scan, lifted)
+        down = snap_to_ground(scan, lifted)
         assert abs(down[2] - box[2]) < 0.1 and (down[[0, 1, 3, 4, 5, 6]]
-                                               == lifted[[0, 1, 3, 4, 5, 6]]).all()
-        around = to_cluster(scan, lifted)
+                                                == lifted[[0, 1, 3, 4, 5, 6]]).all()
+        around = snap_to_cluster(scan, lifted)
         assert np.hypot(*(around[:2] - box[:2])) < 0.4
         assert abs(np.angle(np.exp(1j * (around[6] - lifted[6])))) <= np.pi / 4 + 1e-9
     with pytest.raises(InputError, match="no cluster"):
-        to_cluster(scan, np.array([0, 0, 50.0, 1, 1, 1, 0]))
+        snap_to_cluster(scan, np.array([0, 0, 50.0, 1, 1, 1, 0]))
     with pytest.raises(InputError, match="no ground"):
-        to_ground(scan, np.array([500.0, 0, 0, 1, 1, 1, 0]))
+        snap_to_ground(scan, np.array([500.0, 0, 0, 1, 1, 1, 0]))

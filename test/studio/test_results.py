@@ -21,20 +21,20 @@ from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.open import open_recording
 from lidar_perception.types import Detections, GroundTruth, InputError
 from lidar_perception.wire.codec import bag_message
-from lidar_studio.cli.view import short_names
-from lidar_studio.drive import one_drive, scanned
-from lidar_studio.picture import browser_here
+from lidar_studio.cli.view import make_short_names
+from lidar_studio.drive import segment_frame, select_drive
 from lidar_studio.results import (
     Results,
     Source,
-    by_files,
-    compared,
-    points_topic,
-    recorded,
-    recorded_scan,
-    tracks_of,
-    with_recorded_scans,
+    choose_points_topic,
+    file_source,
+    match_detections,
+    read_recorded_results,
+    read_recorded_scan,
+    tracks_to_json,
+    use_recorded_scans,
 )
+from lidar_studio.screenshot import find_browser
 from msg_utils.markers import MarkedObjects, to_marker_array
 from msg_utils.stamps import make_header
 
@@ -49,7 +49,7 @@ def truth(boxes, class_ids):
 def wrong(*arguments, **more):
     """Rows that are missed, and false; every row must be counted once."""
     truth, found, least, *_ = arguments
-    result = compared(*arguments, **more)
+    result = match_detections(*arguments, **more)
     hits = len(truth) - len(result["missed"]) - len(result["ignored_labels"])
     assert hits == (found.scores >= least).sum() - len(result["false"]) - len(result["ignored"])
     return {"missed": result["missed"], "false": result["false"]}
@@ -81,7 +81,7 @@ def test_a_van_is_neither_missed_nor_makes_a_car_there_false():
     assert wrong(truth(CARS[:1], [VAN]), Detections.none(), 0.0) == {"missed": [], "false": []}
     found = Detections.of(CARS[:1], CAR, 0.9)
     assert wrong(truth(CARS[:1], [VAN]), found, 0.0) == {"missed": [], "false": []}
-    result = compared(truth(CARS, [CAR, VAN]), Detections.of(CARS, CAR, 0.9), 0.0)
+    result = match_detections(truth(CARS, [CAR, VAN]), Detections.of(CARS, CAR, 0.9), 0.0)
     assert (result["ignored_labels"], result["ignored"]) == ([1], [1])
 
 
@@ -106,12 +106,12 @@ def test_what_a_source_cannot_detect_it_does_not_miss(drive_bag):
 
 
 def test_the_ground_and_clusters_of_a_bag_without_them_are_our_own(drive_bag):
-    assert points_topic(drive_bag) == "/points"
-    drive = one_drive(open_recording(drive_bag))
-    ours, theirs = scanned(drive.frames[1]), recorded_scan(drive.frames[1])
+    assert choose_points_topic(drive_bag) == "/points"
+    drive = select_drive(open_recording(drive_bag))
+    ours, theirs = segment_frame(drive.frames[1]), read_recorded_scan(drive.frames[1])
     for name in ("xyz", "ground", "cluster_ids"):
         assert np.array_equal(getattr(ours, name), getattr(theirs, name))
-    assert with_recorded_scans(drive).clouds(1).encoded() == ours.encoded()
+    assert use_recorded_scans(drive).load_scan(1).encode() == ours.encode()
 
 
 NUMBERS = st.lists(st.integers(-2**31, 2**31 - 1), min_size=1, max_size=6, unique=True)
@@ -121,7 +121,7 @@ NUMBERS = st.lists(st.integers(-2**31, 2**31 - 1), min_size=1, max_size=6, uniqu
 def test_no_two_trackers_have_a_track_of_the_same_id(trackers, far):
     """Whatever they call them, also where one counts on from the other's numbers."""
     trackers[1] = [*{*trackers[1], *(n + far for n in trackers[0] if n + far < 2**31)}]
-    made = [[t["id"] for t in tracks_of({0: marked(numbers)}, "/a/output/tracks", k)]
+    made = [[t["id"] for t in tracks_to_json({0: marked(numbers)}, "/a/output/tracks", k)]
             for k, numbers in enumerate(trackers)]
     every = [number for each in made for number in each]
     assert len(set(every)) == len(every) == sum(map(len, trackers))
@@ -131,7 +131,7 @@ def test_no_two_trackers_have_a_track_of_the_same_id(trackers, far):
 
 def test_a_track_is_what_its_tracker_called_it_last():
     first, then = marked([7]), replace(marked([7]), labels=["Cyclist"])
-    track, = tracks_of({0: first, 1: then}, "/a/output/tracks", 0)
+    track, = tracks_to_json({0: first, 1: then}, "/a/output/tracks", 0)
     assert track["class"] == "Cyclist" and len(track["boxes"]) == 2
 
 
@@ -149,7 +149,7 @@ def test_tracks_of_all_trackers_in_a_bag_keep_apart(tmp_path):
             made.write(topic, 10, to_marker_array(
                 np.tile([5.0, 0, 0, 1, 1, 1, 0], (2, 1)), ["Car"] * 2, ids=ids,
                 header=make_header(10, "velodyne", bag_message), make=bag_message))
-    found = recorded(BagPoses(BagHandle(tmp_path / "bag"), ""), [10]).tracks
+    found = read_recorded_results(BagPoses(BagHandle(tmp_path / "bag"), ""), [10]).tracks
     assert len({t["id"] for t in found}) == len(found) == 4
     assert {t["source"] for t in found} == {"a", "b"}
 
@@ -157,8 +157,8 @@ def test_tracks_of_all_trackers_in_a_bag_keep_apart(tmp_path):
 def test_sources_have_names_that_tell_them_apart():
     paths = [Path(name) for name in ("fused", "robot/fused.json", "a/v4/best.safetensors",
                                      "b/v4/best.safetensors", "/out/data", "x/y.json", "x/y.onnx")]
-    assert short_names(paths, ["data"]) == ["fused", "robot/fused", "a/v4/best", "b/v4/best",
-                                            "out/data", "x/y.json", "x/y.onnx"]
+    assert make_short_names(paths, ["data"]) == ["fused", "robot/fused", "a/v4/best", "b/v4/best",
+                                                 "out/data", "x/y.json", "x/y.onnx"]
 
 
 def ended(word: str) -> bool:
@@ -180,10 +180,10 @@ def command_line(process: Path) -> str:
 
 def test_result_files_that_are_not_there_are_named(tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
-        by_files(tmp_path / "none")
+        file_source(tmp_path / "none")
 
 
-@pytest.mark.skipif(browser_here() is None, reason="chromium is not installed")
+@pytest.mark.skipif(find_browser() is None, reason="chromium is not installed")
 def test_a_screenshot_is_a_picture_of_the_page_and_leaves_no_browser_behind(drive_bag, tmp_path,
                                                                             monkeypatch):
     import matplotlib.image

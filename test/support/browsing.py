@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from lidar_studio.picture import browser_here
+from lidar_studio.screenshot import find_browser
 
 FLAGS = ("--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic --no-first-run "
          "--disable-background-networking --disable-component-update --disable-sync").split()
@@ -17,7 +17,7 @@ FLAGS = ("--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic 
 def browsing() -> Iterator:
     """Playwright's browser, without a window; where there is none, the test is skipped."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if (path := browser_here()) is None:
+    if (path := find_browser()) is None:
         pytest.skip("chromium is not installed")
     with sync_api.sync_playwright() as playwright:
         started = playwright.chromium.launch(executable_path=path, args=FLAGS)

@@ -1,4 +1,4 @@
-"""What the page shows, as its server has it."""
+"""Content of the page: a drive with labels or results, or a running graph."""
 
 from __future__ import annotations
 
@@ -11,35 +11,40 @@ from typing import Any
 from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.labels.exchange import FORMATS
 from lidar_perception.types import CLASSES, PEDESTRIAN
-from lidar_studio.drive import Drive, classes
-from lidar_studio.live import Live
+from lidar_studio.drive import Drive, list_classes
+from lidar_studio.live_graph import LiveGraph
 from lidar_studio.session import Session
 
 
 @dataclass(eq=False)
-class Served:
-    """What the page shows: a drive, or a running graph. session: the labels being made; None:
-    results are only looked at. layers: of frame i from a score on, as /api/labels has it, None
-    where there is nothing to show; tracks: as the page has them, where results are looked at."""
+class PageContent:
+    """Content of the page.
 
-    drive: Drive | Live
+    drive: a drive, or the newest frames of a running graph.
+    session: the labels being made; None if results are only viewed.
+    layers: (i, min_score) -> the answer of /api/labels; None without labels and detections.
+    tracks: returns the JSON objects of the tracks to view.
+    token: that requests must contain.
+    """
+
+    drive: Drive | LiveGraph
     session: Session | None = None
     layers: Callable[[int, float], dict[str, Any]] | None = None
     tracks: Callable[[], Sequence[dict[str, Any]]] = tuple
     token: str = field(default_factory=partial(secrets.token_urlsafe, 24))
 
     @property
-    def live(self) -> Live | None:
-        """The running graph, if that is shown."""
-        return self.drive if isinstance(self.drive, Live) else None
+    def live(self) -> LiveGraph | None:
+        """The running graph, None for a drive."""
+        return self.drive if isinstance(self.drive, LiveGraph) else None
 
-    def described(self) -> dict[str, Any]:
-        """As /api/drive has it."""
+    def to_json(self) -> dict[str, Any]:
+        """Return the answer of /api/drive."""
         common = {"name": self.drive.name, "mode": "label" if self.session else "view",
-                  "classes": classes(), "live": self.live is not None,
+                  "classes": list_classes(), "live": self.live is not None,
                   "min_score": ScoreParams().get(CLASSES[PEDESTRIAN]),
                   "can_export": [*FORMATS] if self.session else []}
-        if isinstance(self.drive, Live):
+        if isinstance(self.drive, LiveGraph):
             return {**common, "path": "", "layout": "live", "has": [],
                     "first": self.drive.first, "frames": self.drive.frames(),
                     "status": self.drive.status()}

@@ -1,7 +1,7 @@
-"""Tracks to the labels of a drive and back, as the formats read and write them.
+"""Conversion between tracks and the labels of a drive that label formats read and write.
 
-What a file says that tracks have no place for stays with them: of a box in Track.extra, by frame;
-of frames and of the drive in State.kept.
+Fields of a file that tracks do not have are preserved: those of a box in Track.extra, those of a
+frame or of the drive in State.kept.
 """
 
 from __future__ import annotations
@@ -18,23 +18,25 @@ from lidar_perception.labels.formats.files import replace_non_finite
 from lidar_studio.state import ACCEPTED, KEY, Box, Kept, State, Track, track_to_json
 
 IMPORTED = "imported"  # source of a track
-ID, SCORE, REST = "track_id", "score", "rest"  # of Track.extra
+ID, SCORE, REST = "track_id", "score", "rest"  # keys of Track.extra
 
 
-def from_labels(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str, Any]]:
-    """Accepted tracks of key boxes, numbered from first_id; and what State.kept is to hold. Boxes
-    of one track id and one class are a track; a box without an id is one of its own."""
+def to_tracks(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str, Any]]:
+    """Make accepted tracks of key boxes, with ids from first_id on, and the value of State.kept.
+
+    Boxes with the same track id and class form a track; a box without an id is its own track.
+    """
     found: dict[tuple[Any, ...], tuple[str, dict[int, Box], dict[int, dict[str, Any]]]] = {}
     for f, frame in enumerate(labels.frames):
         for k, name in enumerate(frame.class_names):
             number, score = int(frame.track_ids[k]), float(frame.scores[k])
-            said = {ID: number, REST: replace_non_finite(frame.extra[k]),
-                    **({} if math.isnan(score) else {SCORE: score})}
+            fields = {ID: number, REST: replace_non_finite(frame.extra[k]),
+                      **({} if math.isnan(score) else {SCORE: score})}
             key = (number, name) if number != NO_TRACK else (NO_TRACK, f, k)
-            if key in found and f in found[key][1]:  # an id twice in a frame: two tracks
+            if key in found and f in found[key][1]:  # an id twice in one frame
                 key = NO_TRACK, f, k
             _, boxes, extra = found.setdefault(key, (name, {}, {}))
-            boxes[f], extra[f] = Box.of(frame.boxes[k], KEY), said
+            boxes[f], extra[f] = Box.of(frame.boxes[k], KEY), fields
     tracks = [Track(number, name, ACCEPTED, 1.0, IMPORTED, boxes, frozenset(), extra)
               for number, (name, boxes, extra) in enumerate(found.values(), first_id)]
     notes = {str(f): replace_non_finite(frame.notes)
@@ -42,25 +44,25 @@ def from_labels(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[s
     return tracks, {"notes": notes, "extra": replace_non_finite(labels.extra)}
 
 
-def digest_of(tracks: Sequence[Track], kept: Kept) -> str:
-    """Of what from_labels gave, whatever the numbers of the tracks are."""
+def compute_digest(tracks: Sequence[Track], kept: Kept) -> str:
+    """Compute a digest of the result of to_tracks that does not depend on the ids."""
     rows = [{**track_to_json(t), "id": 0} for t in tracks]
     return hashlib.sha256(json.dumps([rows, kept], sort_keys=True).encode()).hexdigest()[:16]
 
 
-def joined(before: Kept, new: Kept) -> dict[str, Any]:
-    """State.kept after another import: nothing of the one before is lost."""
+def join_extras(before: Kept, new: Kept) -> dict[str, Any]:
+    """Combine State.kept with the extras of another import; nothing is lost."""
     notes = {f: list(rows) for f, rows in before.get("notes", {}).items()}
     for f, rows in new["notes"].items():
-        there = notes.setdefault(f, [])
-        there += [row for row in rows if row not in there]
+        known = notes.setdefault(f, [])
+        known += [row for row in rows if row not in known]
     return {"notes": notes, "extra": {**before.get("extra", {}), **new["extra"]}}
 
 
 def to_labels(state: State, frames: Sequence[Frame]) -> DriveLabels:
-    """The accepted tracks, frame by frame, by their ids, or by those that they were imported
-    with."""
-    ids = _exported_ids(state)
+    """Convert the accepted tracks to labels by frame, with the ids they were imported with, if
+    any."""
+    ids = _choose_ids(state)
     rows: list[list[tuple[Track, Box, dict[str, Any]]]] = [[] for _ in frames]
     for number in sorted(ids):
         track = state.tracks[number]
@@ -71,27 +73,26 @@ def to_labels(state: State, frames: Sequence[Frame]) -> DriveLabels:
         FrameLabels.of(frame.name, frame.stamp_ns, [box.values for _, box, _ in rows[f]],
                        [track.class_name for track, _, _ in rows[f]],
                        [ids[track.id] for track, _, _ in rows[f]],
-                       [said.get(SCORE, math.nan) for _, _, said in rows[f]],
-                       [said.get(REST, {}) for _, _, said in rows[f]],
-                       [(name, said) for name, said in notes.get(str(f), [])])
+                       [fields.get(SCORE, math.nan) for _, _, fields in rows[f]],
+                       [fields.get(REST, {}) for _, _, fields in rows[f]],
+                       [(name, fields) for name, fields in notes.get(str(f), [])])
         for f, frame in enumerate(frames)], dict(state.kept.get("extra", {})))
 
 
-def _exported_ids(state: State) -> dict[int, int]:
-    """Of the accepted tracks."""
+def _choose_ids(state: State) -> dict[int, int]:
+    """Choose unique exported ids for the accepted tracks, preferably the imported ones."""
     chosen = [t for t in state.tracks.values() if t.state == ACCEPTED]
     found: dict[int, int] = {}
-    taken = set[int]()
+    used = set[int]()
     for t in chosen:
-        said = {extra[ID] for extra in t.extra.values() if ID in extra}
-        if len(t.boxes) > 1:  # boxes without an id that a person joined are a track
-            said.discard(NO_TRACK)
-        if len(said) == 1 and (number := said.pop()) not in taken:
+        fields = {extra[ID] for extra in t.extra.values() if ID in extra}
+        if len(t.boxes) > 1:  # boxes without an id that a person merged
+            fields.discard(NO_TRACK)
+        if len(fields) == 1 and (number := fields.pop()) not in used:
             found[t.id] = number
-            taken |= {number} - {NO_TRACK}
+            used |= {number} - {NO_TRACK}
     for t in chosen:
         if t.id not in found:
-            found[t.id] = t.id if t.id not in taken else max(taken | set(state.tracks)) + 1
-            taken.add(found[t.id])
+            found[t.id] = t.id if t.id not in used else max(used | set(state.tracks)) + 1
+            used.add(found[t.id])
     return found
-

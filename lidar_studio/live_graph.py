@@ -1,0 +1,311 @@
+"""The newest frames of a running graph for the page: clouds, with the boxes of the same stamp.
+
+Independent of ROS: the node in live_view.py passes the messages in.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.intensity import StreamScale
+from lidar_perception.robot.poses import transform_boxes, transform_points
+from lidar_perception.robot.transform_tree import MissingTransform, TransformTree
+from lidar_perception.types import InputError
+from lidar_perception.wire.messages import to_truth
+from lidar_perception.wire.track_markers import read_trails
+from lidar_studio.drive import Scan
+from lidar_studio.results import (
+    detections_with_sources,
+    layers_to_json,
+    make_track_id,
+    match_detections,
+    name_source,
+    scan_from_message,
+    tracks_to_json,
+)
+from msg_utils.markers import MarkedObjects
+from msg_utils.stamps import to_ns
+
+Array = np.ndarray[Any, Any]
+BOXES, TRACKS, LABELS = "detections", "tracks", "labels"  # kinds of box topics
+MAX_BYTES, MAX_FRAMES = 300 * 10**6, 300  # of stored clouds: 30 s at 10 Hz
+MAX_WAIT_S = 0.5       # a cloud waits so long for its boxes before it is shown without them
+MAX_EARLY_ARRAYS = 50  # per topic, that wait for their cloud
+
+
+@dataclass
+class BoxTopic:
+    """A topic with boxes, and its statistics.
+
+    number: among the topics of its kind.
+    late: arrays that arrived after their cloud was shown.
+    unmatched: arrays without a cloud.
+    tf_problem: why its boxes cannot be transformed to the cloud's frame, or "".
+    early: by stamp, arrays whose cloud has not arrived.
+    delays: behind the cloud, in milliseconds.
+    """
+
+    kind: str
+    number: int
+    received: int = 0
+    late: int = 0
+    unmatched: int = 0
+    tf_problem: str = ""
+    early: OrderedDict[int, tuple[Any, Any]] = field(default_factory=OrderedDict)
+    delays: deque[float] = field(default_factory=lambda: deque(maxlen=50))
+
+
+@dataclass
+class LiveFrame:
+    """A cloud (PointCloud2) with its objects and trails by topic. received: monotonic seconds."""
+
+    number: int
+    stamp_ns: int
+    cloud: Any
+    received: float
+    objects: dict[str, MarkedObjects] = field(default_factory=dict)
+    trails: dict[str, dict[int, Array]] = field(default_factory=dict)  # by make_track_id
+    shown: bool = False
+
+
+class LiveGraph:
+    """The newest frames of a running graph; thread-safe.
+
+    Frames are numbered in order of arrival. The oldest are dropped beyond max_frames or max_bytes.
+
+    listeners: called with every event of /api/events.
+    lines: problems with the topics, set by the node.
+    values: reception statistics of the clouds, set by the node.
+    tree: transforms for boxes in other frames than their cloud's; filled by the thread that calls
+        add_cloud() and add_boxes().
+    """
+
+    def __init__(self, name: str, max_bytes: int = MAX_BYTES,
+                 max_frames: int = MAX_FRAMES) -> None:
+        self.name, self.max_bytes, self.max_frames = name, max_bytes, max_frames
+        self.listeners: list[Callable[[dict[str, Any]], None]] = []
+        self.lines: list[str] = []
+        self.values: Mapping[str, Any] = {}
+        self.topics: dict[str, BoxTopic] = {}
+        self.tree = TransformTree()
+        self.skipped = 0         # clouds that arrived while a page was paused
+        self._frames: dict[int, LiveFrame] = {}
+        self._by_stamp: dict[int, LiveFrame] = {}
+        self._next = self._bytes = 0
+        self._holding: set[int] = set()
+        self._awaiting_tf: list[tuple[LiveFrame, str, MarkedObjects, Any]] = []
+        self._numbers: dict[tuple[str, str], int] = {}  # BoxTopic.number
+        self._last_status: dict[str, Any] = {}
+        self._scale = StreamScale()
+        self._lock = threading.RLock()
+
+    @property
+    def first(self) -> int:
+        """Number of the oldest stored frame."""
+        with self._lock:
+            return next(iter(self._frames), self._next)
+
+    @property
+    def end(self) -> int:
+        """One past the number of the newest frame."""
+        return self._next
+
+    def set_held(self, page: int, held: bool) -> None:
+        """Hold or release the frames for a page. While held, new clouds are skipped."""
+        with self._lock:
+            (self._holding.add if held else self._holding.discard)(page)
+
+    def expect_topic(self, topic: str, kind: str) -> None:
+        """Expect boxes of a kind on a topic, so that clouds wait for them."""
+        with self._lock:
+            if topic not in self.topics:
+                number = sum(other_kind == kind for other_kind, _ in self._numbers)
+                self.topics[topic] = BoxTopic(kind, self._numbers.setdefault((kind, topic), number))
+
+    def forget_topic(self, topic: str) -> None:
+        """Stop expecting boxes on a topic without publishers."""
+        with self._lock:
+            self.topics.pop(topic, None)
+
+    def add_cloud(self, message: Any) -> None:
+        """Add a PointCloud2. Boxes belong to the last cloud of their stamp, as a bag may loop."""
+        with self._lock:
+            stamp = to_ns(message.header.stamp)
+            if self._holding:
+                self.skipped += 1
+                return
+            frame = LiveFrame(self._next, stamp, message, monotonic())
+            self._frames[self._next] = self._by_stamp[stamp] = frame
+            self._next += 1
+            self._bytes += len(message.data)
+            while len(self._frames) > 1 and (self._bytes > self.max_bytes
+                                             or len(self._frames) > self.max_frames):
+                old = self._frames.pop(self.first)
+                if self._by_stamp.get(old.stamp_ns) is old:
+                    del self._by_stamp[old.stamp_ns]
+                self._bytes -= len(old.cloud.data)
+            for topic, box_topic in self.topics.items():
+                if stamp in box_topic.early:
+                    self._add_objects(frame, topic, *box_topic.early.pop(stamp))
+        self.update()
+
+    def add_boxes(self, topic: str, objects: MarkedObjects, message: Any) -> None:
+        """Add an array of boxes. message: the MarkerArray with trails, or None."""
+        with self._lock:
+            if (box_topic := self.topics.get(topic)) is None:
+                return
+            box_topic.received += 1
+            objects = _keep_valid(objects)
+            frame = self._by_stamp.get(objects.stamp_ns)
+            if frame is None or topic in frame.objects:  # a bag loops, or it is early
+                box_topic.early[objects.stamp_ns] = objects, message
+                while len(box_topic.early) > MAX_EARLY_ARRAYS:
+                    box_topic.early.popitem(last=False)
+                    box_topic.unmatched += not self._holding
+                return
+            box_topic.delays.append(1e3 * (monotonic() - frame.received))
+            self._add_objects(frame, topic, objects, message)
+        self.update()
+
+    def _add_objects(self, frame: LiveFrame, topic: str, objects: MarkedObjects,
+                     message: Any) -> None:
+        """Add boxes to their frame, in the cloud's coordinates; wait for TF if that is late."""
+        box_topic, own = self.topics[topic], frame.cloud.header.frame_id
+        trails = read_trails(message) if message is not None and box_topic.kind == TRACKS else {}
+        if objects.frame_id.lstrip("/") not in ("", own.lstrip("/")):
+            try:
+                pose = self.tree.lookup(own, objects.frame_id, frame.stamp_ns)
+            except MissingTransform as error:
+                if error.late and monotonic() - frame.received <= MAX_WAIT_S:
+                    self._awaiting_tf.append((frame, topic, objects, message))
+                else:
+                    box_topic.tf_problem = str(error)
+                return
+            objects = replace(objects, boxes=transform_boxes(objects.boxes, pose))
+            trails = {number: transform_points(trail, pose) for number, trail in trails.items()}
+        box_topic.tf_problem = ""
+        frame.objects[topic] = objects
+        frame.trails[topic] = {make_track_id(box_topic.number, n): trail
+                               for n, trail in trails.items()}
+        if frame.shown:
+            # Labels may arrive at any time, and the first array of a topic was not expected.
+            box_topic.late += box_topic.kind != LABELS and box_topic.received > 1
+            self._notify(self._event(frame))
+
+    def update(self) -> None:
+        """Show the newest frame that has all its boxes or has waited MAX_WAIT_S, and report a
+        changed status. Call it periodically."""
+        with self._lock:
+            now = monotonic()
+            waiting, self._awaiting_tf = self._awaiting_tf, []
+            for frame, topic, objects, message in waiting:
+                if topic in self.topics:
+                    self._add_objects(frame, topic, objects, message)
+            wanted = {topic for topic, t in self.topics.items()
+                      if t.received and t.kind != LABELS and not t.tf_problem}
+            for frame in reversed(self._frames.values()):
+                if frame.shown:
+                    break
+                if wanted <= frame.objects.keys() or now - frame.received > MAX_WAIT_S:
+                    for older in self._frames.values():
+                        if not older.shown and older.number <= frame.number:
+                            older.shown = True
+                            self._notify(self._event(older))
+                    break
+            if (status := self.status()) != self._last_status:
+                self._last_status = status
+                self._notify({"status": status})
+
+    def _notify(self, event: dict[str, Any]) -> None:
+        for listener in list(self.listeners):
+            listener(event)
+
+    def status(self) -> dict[str, Any]:
+        """Return the problems as lines of text, and the statistics of the clouds and of each box
+        topic."""
+        with self._lock:
+            lines = [*self.lines, *(
+                f"boxes of {topic} are not shown: {box_topic.tf_problem}"
+                for topic, box_topic in self.topics.items() if box_topic.tf_problem)]
+            return {"lines": lines, "clouds": {**self.values, "passed": self.skipped},
+                    "topics": [{"topic": topic, "kind": t.kind, "came": t.received,
+                                "late": t.late, "alone": t.unmatched,
+                                "ms": round(float(np.median(t.delays)), -1) if t.delays else None}
+                               for topic, t in self.topics.items()]}
+
+    def _event(self, frame: LiveFrame) -> dict[str, Any]:
+        return {"live": {"first": self.first, **_frame_to_json(frame),
+                         "tracks": self._tracks([frame])}}
+
+    def _tracks(self, frames: list[LiveFrame]) -> list[dict[str, Any]]:
+        """Convert the tracks in some frames to JSON objects of the page, with trails by frame."""
+        made: list[dict[str, Any]] = []
+        for topic, box_topic in self.topics.items():
+            if box_topic.kind != TRACKS:
+                continue
+            with_them = {f.number: f.objects[topic] for f in frames if topic in f.objects}
+            for track in tracks_to_json(with_them, topic, box_topic.number):
+                track["trails"] = {
+                    f.number: np.round(f.trails[topic][track["id"]], 3).tolist() for f in frames
+                    if track["id"] in f.trails.get(topic, ())}
+                made.append(track)
+        return made
+
+    def tracks(self) -> list[dict[str, Any]]:
+        """Return the tracks of all shown frames, as JSON objects of the page."""
+        with self._lock:
+            return self._tracks([f for f in self._frames.values() if f.shown])
+
+    def frames(self) -> list[dict[str, Any]]:
+        """List the shown frames, as in the answer of /api/drive."""
+        with self._lock:
+            return [_frame_to_json(frame) for frame in self._frames.values() if frame.shown]
+
+    def _frame(self, i: int) -> LiveFrame:
+        with self._lock:
+            if (frame := self._frames.get(i)) is None:
+                raise InputError(f"frame {i} is no longer stored; the oldest is {self.first}")
+            return frame
+
+    def load_scan(self, i: int) -> Scan:
+        """Return the scan of a frame, with the cloud's ground and clusters. InputError if the cloud
+        is invalid or no longer stored."""
+        return scan_from_message(self._frame(i).cloud, scale=self._scale)
+
+    def layers(self, i: int, min_score: float) -> dict[str, Any]:
+        """Return the answer of /api/labels: labels, detections, and missed labels at a minimum
+        score. False detections are unknown, as it is unknown where labels end."""
+        with self._lock:
+            objects = self._frame(i).objects
+            of_kind = {kind: {t: o for t, o in objects.items() if t in self.topics
+                              and self.topics[t].kind == kind} for kind in (BOXES, LABELS)}
+        found = {name_source(t): detections_with_sources(o) for t, o in of_kind[BOXES].items()}
+        truth = next((to_truth(o) for o in of_kind[LABELS].values()), None)
+        matches = {} if truth is None else {
+            name: {**match_detections(truth, d, min_score), "false": None, "ignored": None}
+            for name, d in found.items()}
+        return layers_to_json(truth, found, matches)
+
+
+def _keep_valid(objects: MarkedObjects) -> MarkedObjects:
+    """Keep objects with finite numbers and positive sizes; nodes may send others."""
+    good = (np.isfinite(objects.boxes).all(axis=1) & (objects.boxes[:, 3:6] > 0).all(axis=1)
+            & np.isfinite(objects.scores))
+    if good.all():
+        return objects
+    rows = np.flatnonzero(good).tolist()
+    return replace(objects, boxes=objects.boxes[good], scores=objects.scores[good],
+                   ids=objects.ids[good], labels=[objects.labels[k] for k in rows],
+                   extras=[objects.extras[k] for k in rows])
+
+
+def _frame_to_json(frame: LiveFrame) -> dict[str, Any]:
+    return {"frame": frame.number, "name": f"{frame.stamp_ns / 1e9:.2f} s",
+            "stamp_ns": frame.stamp_ns}

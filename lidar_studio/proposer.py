@@ -1,0 +1,310 @@
+"""Proposals for a labelling session: runs the survey of the drive and merges proposed tracks with
+the existing ones."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.candidates.configurations import BEST
+from lidar_perception.candidates.seeds import Seed, seed_from_points
+from lidar_perception.candidates.silhouette import compute_similarity, to_pixels
+from lidar_perception.classes import Size
+from lidar_perception.detectors.contract import FUSED
+from lidar_perception.detectors.open import DetectorChoice
+from lidar_perception.geometry import centre_distances, points_in_box, to_box_frame
+from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
+from lidar_studio import survey_cache
+from lidar_studio.drive import Drive
+from lidar_studio.interpolation import Motion, apply_correction
+from lidar_studio.proposals import (
+    CANDIDATES,
+    SAME_OBJECT_DISTANCE_M,
+    ProposalRequest,
+    SilhouetteSeed,
+    SizeSeed,
+    propose_tracks,
+)
+from lidar_studio.size_similarity import choose_cell_size, compute_size_similarity, draw_side_view
+from lidar_studio.state import KEY, Box, State, Track
+from lidar_studio.survey import FrameSurvey, survey_drive
+
+Array = np.ndarray[Any, Any]
+BOX_MARGIN_M = 0.1             # around a box, when taking its points
+MIN_POINTS = 5                 # of a cluster that is compared with a seed
+# Two tracks are the same object if enough boxes coincide: this share of the shorter track's boxes,
+MIN_COMMON_SHARE = 0.5
+SAME_TRACK_DISTANCE_M = 0.7    # with centres within this distance,
+SAME_TRACK_LENGTH_SHARE = 0.4  # or within this share of the length
+
+
+class Proposer:
+    """Proposals for a drive.
+
+    detector: None for proposals from seeds only.
+    folder: of the cached survey, None for no cache.
+    problem: of the cache, or "".
+    """
+
+    def __init__(self, drive: Drive, detector: DetectorChoice | None = DetectorChoice(),
+                 folder: Path | None = None) -> None:
+        self.drive, self.detector, self.folder = drive, detector, folder
+        self.problem = ""
+        self._surveys: list[FrameSurvey] = []  # of the first frames, maybe not yet of all
+        self._seeds: dict[tuple[int, tuple[float, ...]], Seed | None] = {}
+
+    @property
+    def surveys(self) -> list[FrameSurvey] | None:
+        """Surveys of all frames; None until all are surveyed."""
+        return self._surveys if len(self._surveys) == len(self.drive.frames) else None
+
+    @cached_property
+    def _key(self) -> str:
+        return survey_cache.make_key(self.drive, self.detector)
+
+    def load_cached(self) -> None:
+        """Load the cached survey if it belongs to this drive and detector."""
+        if self.folder is None or self._surveys or not self.folder.is_dir():
+            return
+        try:
+            self._surveys, self.problem = survey_cache.read(self.folder, self._key)
+        except InputError as error:
+            self.problem = str(error)
+
+    def survey(self, on_progress: Callable[[int], bool], in_process: bool = False) -> bool:
+        """Survey the remaining frames and cache the result.
+
+        Args:
+            on_progress: called with the number of surveyed frames; returns False to cancel.
+            in_process: run in this process instead of a separate one.
+
+        Returns:
+            True unless cancelled.
+        """
+        surveys = self._surveys
+        if self.folder is not None and not surveys:
+            survey_cache.clear(self.folder)
+        with closing(survey_drive(self.drive, self.detector, in_process,
+                                  len(surveys))) as new_surveys:
+            for survey in new_surveys:
+                if survey is not None:
+                    surveys.append(survey)
+                    self._cache(surveys)
+                if not on_progress(len(surveys)):
+                    return False
+        return True
+
+    def _cache(self, surveys: list[FrameSurvey]) -> None:
+        """Write the last file of the cache once its frames are complete."""
+        size = survey_cache.FRAMES_PER_FILE
+        complete = len(surveys) % size == 0 or len(surveys) == len(self.drive.frames)
+        if self.folder is None or not complete:
+            return
+        first = (len(surveys) - 1) // size * size
+        try:
+            survey_cache.write(self.folder, self._key, first, surveys[first:])
+        except InputError as error:
+            self.problem = str(error)
+
+    def poses(self) -> list[list[float]] | None:
+        """Return the sensor's pose in each frame from scan matching, 16 numbers each; None if the
+        drive has poses or scan matching gave none."""
+        if self.drive.motion.poses is not None or not self.surveys:
+            return None
+        found = [survey.pose for survey in self.surveys if survey.pose is not None]
+        return [np.round(pose, 6).ravel().tolist() for pose in found] if len(found) == len(
+            self.surveys) else None
+
+    def proposals(self, state: State, motion: Motion, frames: range | None = None,
+                  on_progress: Callable[[int], bool] = lambda count: True) -> list[Track] | None:
+        """Return proposed tracks in some frames (None: all) of a surveyed drive, or None if
+        cancelled; on_progress as in propose_tracks()."""
+        seeds = [SilhouetteSeed(seed.silhouette(BEST), seed.height) for seed in self.seeds(state)]
+        sizes = [SizeSeed(t.class_name, _track_size(t, f))
+                 for f, t in self._find_size_seeds(state)]
+        placed: dict[int, list[tuple[Array, str]]] = {}
+        for t in state.tracks.values():
+            for f, b in t.boxes.items() if t.awaits_tracking else ():
+                if b.kind == KEY:
+                    placed.setdefault(f, []).append((np.array(b.values), t.class_name))
+        stamps = [frame.stamp_ns for frame in self.drive.frames]
+        request = ProposalRequest(seeds, sizes, placed, self.detector is not None)
+        surveys = self.surveys or []
+        return propose_tracks(surveys, request, stamps, motion,
+                              range(len(surveys)) if frames is None else frames, on_progress)
+
+    def _find_size_seeds(self, state: State) -> list[tuple[int, Track]]:
+        """Return frame and track of the seeds that are not pedestrians."""
+        found = [(f, state.tracks[t]) for f, t in state.seeds if t in state.tracks]
+        return [(f, t) for f, t in found if f in t.boxes and t.class_name in CLASSES
+                and t.class_name != CLASSES[PEDESTRIAN]]
+
+    def seeds(self, state: State) -> list[Seed]:
+        """Return the pedestrian seeds of a state that have enough points."""
+        found = [self._seed(state.tracks[t], f) for f, t in state.seeds if t in state.tracks]
+        return [seed for seed in found if seed is not None]
+
+    def _seed(self, track: Track, frame: int) -> Seed | None:
+        if frame not in track.boxes or track.class_name != CLASSES[PEDESTRIAN]:
+            return None
+        box = track.boxes[frame].values
+        if (frame, box) not in self._seeds:
+            self._seeds[frame, box] = self.cut_seed(np.array(box), frame)
+        return self._seeds[frame, box]
+
+    def cut_seed(self, box: Array, frame: int) -> Seed | None:
+        """Make a seed from the points in a box (7,) of a frame; None if there are too few."""
+        try:
+            return seed_from_points(self._points_inside(frame, box), box, certain=True)
+        except InputError:
+            return None
+
+    def silhouettes(self, state: State, track: Track, frame: int) -> dict[str, Any]:
+        """Return the answer of /api/silhouettes: a track in a frame next to its most similar seed.
+
+        Pedestrians are shown as silhouettes, other classes as side views. InputError if there is
+        nothing to compare.
+        """
+        if track.class_name != CLASSES[PEDESTRIAN]:
+            return self._compare_side_views(state, track, frame)
+        seeds = self.seeds(state)
+        if not seeds:
+            raise InputError("there is no seed yet; click a pedestrian")
+        box = track.boxes.get(frame)
+        candidate = None if box is None else self.cut_seed(np.array(box.values), frame)
+        if candidate is None:
+            raise InputError(f"track {track.id} has too few points in frame {frame} to be compared")
+        image, templates = candidate.silhouette(BEST), [seed.silhouette(BEST) for seed in seeds]
+        scores = [float(compute_similarity(image[None], t, BEST.stm)[0]) for t in templates]
+        best = int(np.argmax(scores))
+        return {"seed": _bits_to_json(to_pixels(templates[best])),
+                "candidate": _bits_to_json(to_pixels(image)), "similarity": scores[best]}
+
+    def _compare_side_views(self, state: State, track: Track, frame: int) -> dict[str, Any]:
+        seeds = [(f, t) for f, t in self._find_size_seeds(state)
+                 if t.class_name == track.class_name]
+        if not seeds:
+            raise InputError(f"there is no seed of class {track.class_name} yet; click one")
+        if frame not in track.boxes:
+            raise InputError(f"track {track.id} has no box in frame {frame}")
+        box = np.array(track.boxes[frame].values)
+        points = self._points_inside(frame, box)
+        in_box = to_box_frame(points, box)
+        if len(points) < MIN_POINTS:
+            raise InputError(f"track {track.id} has too few points in frame {frame} to be compared")
+        # The box gives the heading, so the extent of the points is their L-shape.
+        sides, shape = np.ptp(in_box[:, :2], axis=0), box.copy()
+        shape[3:6] = sides.max(), sides.min(), in_box[:, 2].max() + box[5] / 2
+        scores = [float(compute_size_similarity(shape[None], _track_size(t, f))[0])
+                  for f, t in seeds]
+        f, seed = seeds[int(np.argmax(scores))]
+        seed_box = np.array(seed.boxes[f].values)
+        cell, seed_points = choose_cell_size(box, seed_box), self._points_inside(f, seed_box)
+        return {"seed": _bits_to_json(draw_side_view(seed_points, seed_box, cell)),
+                "candidate": _bits_to_json(draw_side_view(points, box, cell)),
+                "similarity": max(scores)}
+
+    def _points_inside(self, frame: int, box: Array) -> Array:
+        scan = self.drive.load_scan(frame)
+        return scan.xyz[points_in_box(scan.xyz, box, BOX_MARGIN_M) & ~scan.ground]
+
+    def refine_with_detection(self, frame: int, box: Array, class_name: str) -> Array:
+        """Return the box (7,) of a detection of the class at a clicked cluster's box (7,), or the
+        cluster's box if there is no detection."""
+        if self.surveys is None or class_name not in CLASSES:
+            return box
+        found = self.surveys[frame].detections
+        found = found[found.class_ids == CLASSES.index(class_name)]
+        distances = centre_distances(found.boxes, box[None])[:, 0]
+        if distances.min(initial=np.inf) > max(SAME_OBJECT_DISTANCE_M,
+                                               SAME_TRACK_LENGTH_SHARE * box[3]):
+            return box
+        return found.boxes[int(distances.argmin())].astype(np.float64)
+
+
+def _track_size(track: Track, frame: int) -> Size:
+    length, width, height = track.boxes[frame].values[3:6]
+    return length, width, height
+
+
+def _bits_to_json(pixels: Array) -> dict[str, Any]:
+    return {"rows": pixels.shape[0], "cols": pixels.shape[1],
+            "bits": "".join("01"[bit] for bit in pixels.ravel().astype(int))}
+
+
+def merge_proposals(state: State, proposals: Sequence[Track],
+                    motion: Motion) -> tuple[list[Track], list[int]]:
+    """Merge new proposals with the existing tracks.
+
+    Tracks that a person decided on or changed stay, except that a clicked track is extended by the
+    proposal at its place. Other proposals replace an earlier proposal at their place and take its
+    id; earlier proposals without a new one are removed.
+
+    Returns:
+        The tracks that are new or have changed, and the ids of removed tracks.
+    """
+    index = _TrackIndex(state.tracks)
+    waiting = {t.id for t in state.tracks.values()
+               if not t.has_human_edits and t.source in (FUSED, CANDIDATES)}
+    found: list[Track] = []
+    next_id, used_ids = state.next_id, set[int]()
+    for proposal in proposals:
+        matches = index.find_matches(proposal)
+        by_person = [t for t in matches if t.id not in waiting]
+        if by_person:
+            clicked = next((t for t in by_person
+                            if t.awaits_tracking and t.id not in used_ids), None)
+            if clicked is not None:
+                used_ids.add(clicked.id)
+                found.append(extend_track(clicked, proposal.boxes, motion))
+            continue
+        number = next((t.id for t in matches if t.id not in used_ids), next_id)
+        next_id += number == next_id
+        used_ids.add(number)
+        found.append(replace(proposal, id=number))
+    found += [extend_track(t, {}, motion) for t in state.tracks.values()
+              if t.awaits_tracking and t.id not in used_ids]
+    return [t for t in found if t != state.tracks.get(t.id)], sorted(waiting - used_ids)
+
+
+def extend_track(clicked: Track, boxes: Mapping[int, Box], motion: Motion) -> Track:
+    """Extend a clicked track by the boxes of a proposal, corrected by the track's key boxes."""
+    found: Mapping[int, Box] = {f: b for f, b in boxes.items() if f not in clicked.gone}
+    for frame, box in sorted(clicked.boxes.items()):
+        if box.kind == KEY:
+            found = apply_correction(found, clicked.gone, frame, box.values, motion)
+    return replace(clicked, boxes=dict(sorted(found.items())), nearby=False)
+
+
+class _TrackIndex:
+    """Positions of tracks by frame."""
+
+    def __init__(self, tracks: Mapping[int, Track]) -> None:
+        self._tracks = tracks
+        rows: dict[int, list[tuple[float, ...]]] = {}
+        for t in tracks.values():
+            for f, b in t.boxes.items():
+                rows.setdefault(f, []).append((t.id, b.values[0], b.values[1], b.values[3]))
+        self._rows = {f: np.array(r) for f, r in rows.items()}
+
+    def find_matches(self, proposal: Track) -> list[Track]:
+        """Return the tracks of the same object, the one with the most boxes in common first."""
+        votes: Counter[int] = Counter()
+        for f, b in proposal.boxes.items():
+            rows = self._rows.get(f)
+            if rows is not None:
+                distances = np.hypot(rows[:, 1] - b.values[0], rows[:, 2] - b.values[1])
+                lengths = np.minimum(rows[:, 3], b.values[3])
+                matches = distances <= np.maximum(SAME_TRACK_DISTANCE_M,
+                                                  SAME_TRACK_LENGTH_SHARE * lengths)
+                votes.update(rows[matches, 0].astype(int).tolist())
+        shorter = {n: min(len(self._tracks[n].boxes), len(proposal.boxes)) for n in votes}
+        return [self._tracks[n] for n, count in votes.most_common()
+                if count >= MIN_COMMON_SHARE * shorter[n]]
