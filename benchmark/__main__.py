@@ -33,7 +33,7 @@ from lidar_perception.runs.files import write_text
 from lidar_perception.runs.machine import read_cpu_name
 from lidar_perception.runs.memory import keep_freed_memory
 from lidar_perception.runs.terminal import errors
-from lidar_perception.scoring.centres.report import pedestrians
+from lidar_perception.scoring.centres.report import select_pedestrians
 from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
@@ -69,7 +69,7 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     recording = next((each for each in recordings if {BOXES, CAMERA} <= each.has), recordings[0])
     recording.require(BOXES, "benchmark")
     recording.require(CAMERA, "benchmark")
-    frames = [f for f in recording if len(pedestrians(f.truth()))]
+    frames = [f for f in recording if len(select_pedestrians(f.truth()))]
     if not frames:
         raise InputError(f"{recording.path} has no frame with a Pedestrian label")
     labelled = [f for each in recordings if POINT_LABELS in each.has

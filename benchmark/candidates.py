@@ -14,7 +14,7 @@ from lidar_perception.candidates.segmented_cloud import SegmentedCloud, fit_grou
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.data.frame import Frame
 from lidar_perception.runs.terminal import console, show_progress
-from lidar_perception.scoring.centres.report import pedestrians
+from lidar_perception.scoring.centres.report import select_pedestrians
 
 SAME = 0.02  # metres between boxes of the same candidate; planes of two RANSACs differ a little
 
@@ -27,7 +27,7 @@ def compare_candidates(frames: list[Frame], repeat: int) -> dict:
     agree = {"frames": len(frames), "labels_identical": 0, "candidates_same_given_ground": 0,
              "candidates": 0, "candidates_same": 0}
     for f in show_progress(frames, "timing", len(frames)):
-        truth, scan, camera = pedestrians(f.truth()), f.load(), f.camera()
+        truth, scan, camera = select_pedestrians(f.truth()), f.load(), f.camera()
         arguments = scan.xyz, camera.projection, camera.width, camera.height, truth
         theirs = [plain_stm_cpa.candidates(*arguments) for _ in range(min(repeat, 3))]
         mine = [find_candidates(scan, make_truth_source(truth), camera, PAPER)

@@ -32,9 +32,9 @@ from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console, show_progress
-from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
-from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
-from lidar_perception.scoring.tracking.pairs import pairs_of, tracked_labels, without_ignored
+from lidar_perception.scoring.tracking.clear import ClearCounts, count_clear
+from lidar_perception.scoring.tracking.hota import HotaCounts, count_hota
+from lidar_perception.scoring.tracking.pairs import drop_ignored, make_pairs, to_tracked_labels
 from lidar_perception.simulation.camera import FORWARD_CAMERA, make_kitti_labels
 from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.scene import Scenes
@@ -92,9 +92,9 @@ def counts_of(drive: list[Seen], step: Step, classes: tuple[str, ...]) -> Counts
     frames = []
     for seen in drive:
         ids, found = step(seen)
-        frames.append(pairs_of(seen.truth, tracked_labels(ids, found), FORWARD_CAMERA))
-    return {name: (hota_counts(own := [without_ignored(f[name]) for f in frames]),
-                   clear_counts(own)) for name in classes}
+        frames.append(make_pairs(seen.truth, to_tracked_labels(ids, found), FORWARD_CAMERA))
+    return {name: (count_hota(own := [drop_ignored(f[name]) for f in frames]),
+                   count_clear(own)) for name in classes}
 
 
 def measured(drives: list[Drive], detector: str, params: TrackingParams) -> dict:

@@ -22,7 +22,7 @@ from lidar_perception.ground.threshold import (
     segment_by_threshold,
 )
 from lidar_perception.runs.terminal import show_progress
-from lidar_perception.scoring.points.segmentation import PROTOCOLS, GroundReport, ground_by_protocol
+from lidar_perception.scoring.points.segmentation import PROTOCOLS, GroundReport, count_by_protocol
 from lidar_perception.types import SENSOR_HEIGHT, PointCloud
 
 PARAMS = GroundParams()
@@ -184,7 +184,7 @@ def measure_labelled(frames: list[Frame], repeat: int) -> dict:
             frame, semantic = item.load(), item.point_truth().classes
             clock = clock or Clock(min(repeat, SLOW_REPEAT), calls(frame))
             for name, found in clock.time(calls(frame)).items():
-                counts = ground_by_protocol(found, semantic, frame.xyz[:, 2])
+                counts = count_by_protocol(found, semantic, frame.xyz[:, 2])
                 reports[name].update(counts, clock.ms[name][-1])
     return {"scans": len(frames), "protocols": list(PROTOCOLS),
             "methods": {name: reports[name].compute() if name in reports

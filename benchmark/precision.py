@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidar_perception.scoring.tracking.pairs import ALIKE, EPS, Pairs, pairs_of, tracked_labels
+from lidar_perception.scoring.tracking.pairs import (
+    EPS,
+    MIN_SIMILARITY,
+    Pairs,
+    make_pairs,
+    to_tracked_labels,
+)
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 
 if TYPE_CHECKING:
@@ -30,7 +36,7 @@ def curve_of(drive: list[Seen], step: Step, classes: tuple[str, ...]) -> dict[st
     parts: dict[str, list[Curve]] = {name: [] for name in classes}
     for seen in drive:
         ids, found = step(seen)
-        pairs = pairs_of(seen.truth, tracked_labels(ids, found), FORWARD_CAMERA)
+        pairs = make_pairs(seen.truth, to_tracked_labels(ids, found), FORWARD_CAMERA)
         for name in classes:
             parts[name].append(_of_frame(pairs[name]))
     return {name: Curve(np.concatenate([p.scores for p in own]),
@@ -39,7 +45,7 @@ def curve_of(drive: list[Seen], step: Step, classes: tuple[str, ...]) -> dict[st
 
 
 def _of_frame(pairs: Pairs) -> Curve:
-    alike = np.where(pairs.similarity >= ALIKE - EPS, pairs.similarity, 0.0)
+    alike = np.where(pairs.similarity >= MIN_SIMILARITY - EPS, pairs.similarity, 0.0)
     counts, hits = np.ones(len(pairs.scores), bool), np.zeros(len(pairs.scores), bool)
     for k in np.argsort(-pairs.scores, kind="stable"):
         row = int(np.argmax(alike[:, k])) if len(alike) else -1

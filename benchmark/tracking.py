@@ -15,7 +15,7 @@ from lidar_perception.data.frame import Recording
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.params import MIN_SCORE, ScoreParams
 from lidar_perception.runs.terminal import console, show_progress
-from lidar_perception.scoring.tracking.pairs import tracked_labels
+from lidar_perception.scoring.tracking.pairs import to_tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
 from lidar_perception.tracking.drive_tracker import choose_ego_source
 from lidar_perception.tracking.ego import make_pose_reader
@@ -91,7 +91,7 @@ def _measured(drives: Mapping[str, Sequence[Seen]], make: Callable[[], Step]) ->
             start = perf_counter()
             ids, found = step(seen)
             ms.append((perf_counter() - start) * 1e3)
-            report.update(observe(name, i, seen.truth, tracked_labels(ids, found),
+            report.update(observe(name, i, seen.truth, to_tracked_labels(ids, found),
                                   seen.calibration))
     return {**report.compute(), "ms": float(np.median(ms)) if ms else None}
 

@@ -26,9 +26,9 @@ from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.ground import segment
 from lidar_perception.ground.params import GROUND_METHODS, GroundParams
 from lidar_perception.param_fields import with_values
-from lidar_perception.scoring.detections import by_detector
+from lidar_perception.scoring.detections import measure_detector
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.scoring.run import Skipped, results
+from lidar_perception.scoring.run import Skipped, measure_frames
 from lidar_perception.simulation.recording import simulate_recording
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import find_sensor
@@ -193,7 +193,7 @@ def evaluate(detector: str | Path | Detector | Callable[[PointCloud], Detections
         loaded = loaded if min_score is None else loaded.with_min_score(min_score)
     report = DetectionReport(follow=recording.is_sequential)
     numbers = range(min(len(recording), limit or len(recording)))
-    for _, result in results(recording, by_detector(lambda: loaded), numbers):
+    for _, result in measure_frames(recording, measure_detector(lambda: loaded), numbers):
         if isinstance(result, Skipped):
             report.skipped.append(str(result))
         elif result is not None:

@@ -25,8 +25,8 @@ from lidar_perception.detectors.contract import Detector
 from lidar_perception.geometry import bev_iou
 from lidar_perception.intensity import infer_full_scale
 from lidar_perception.runs.terminal import errors
-from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, one_to_one
-from lidar_perception.scoring.recorded import by_stamp
+from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, assign_pairs
+from lidar_perception.scoring.recorded import read_objects_by_stamp
 from lidar_perception.types import Detections, GroundTruth, InputError
 from lidar_perception.wire.messages import (
     FullScale,
@@ -130,7 +130,9 @@ def match_detections(truth: GroundTruth, found: Detections, min_score: float,
         if name == CLASSES[PEDESTRIAN]:
             distances = np.linalg.norm(boxes[:, None, :2] - label_boxes[None, :, :2], axis=2)
             hit |= distances <= MAX_CENTRE_DISTANCE
-        i, j = one_to_one(1.0 - overlaps, hit) if hit.size else (np.zeros(0, int), np.zeros(0, int))
+        i, j = (
+            assign_pairs(1.0 - overlaps, hit) if hit.size else (np.zeros(0, int), np.zeros(0, int))
+        )
         own = truth.class_ids[labels] == CLASSES.index(name)
         missed += labels[own & ~np.isin(np.arange(len(labels)), j)].tolist()
         hits += rows[i[own[j]]].tolist()
@@ -193,7 +195,7 @@ def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:
     bag = poses.handle.bag()
     wanted = {topic for topic, kind in bag.topics.items() if kind == MARKERS and topic != TRUTH
               and topic.endswith((FOUND, TRACKS))}
-    found = by_stamp(bag, sorted(wanted))
+    found = read_objects_by_stamp(bag, sorted(wanted))
     numbers = {stamp: i for i, stamp in enumerate(stamps)}
     sources: dict[str, Source] = {}
     tracks: list[dict[str, Any]] = []

@@ -20,9 +20,9 @@ from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.checkpoint import read_header, save_header
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.runs.terminal import console
-from lidar_perception.scoring.detections import by_detector
+from lidar_perception.scoring.detections import measure_detector
 from lidar_perception.scoring.kitti.protocol import Comparison
-from lidar_perception.scoring.kitti.reliability import lines
+from lidar_perception.scoring.kitti.reliability import fit_calibrations
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.scoring.run import fill
 
@@ -46,8 +46,8 @@ def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -
     for path in weights:
         report = DetectionReport()
         fill(report, open_recording(scans),
-             by_detector(partial(load_uncalibrated, path)), jobs=jobs, limit=limit)
-        found = lines(Comparison.of(report.frames)) if report.frames else {}
+             measure_detector(partial(load_uncalibrated, path)), jobs=jobs, limit=limit)
+        found = fit_calibrations(Comparison.of(report.frames)) if report.frames else {}
         header = read_header(path)
         if lost := sorted({*header.calibration} - {*found}):
             raise click.ClickException(f"{path} stays unchanged: {scans} has too few correct "

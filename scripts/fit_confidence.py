@@ -29,7 +29,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.groups import group_points
 from lidar_perception.runs.files import write_text
-from lidar_perception.scoring.centres.matching import match_centres, range_bins
+from lidar_perception.scoring.centres.matching import find_range_bins, match_centres
 from lidar_perception.training.curves import fit_curves
 from lidar_perception.types import PEDESTRIAN, InputError
 
@@ -65,7 +65,7 @@ def collect_samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | 
     features["height_difference_m"] = np.abs(features["height_m"] - seed.height)
     found, _ = match_centres(boxes, truth)
     return {"features": features, "hit": np.isin(np.arange(len(boxes)), found),
-            "bins": range_bins(boxes), "truth": range_bins(truth)}
+            "bins": find_range_bins(boxes), "truth": find_range_bins(truth)}
 
 
 def find_seed(job: tuple[str, int]) -> Seed | None:

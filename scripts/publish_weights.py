@@ -34,7 +34,7 @@ from lidar_perception.detectors.pointpillars.network import load_network
 from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console
-from lidar_perception.scoring.detections import by_detector
+from lidar_perception.scoring.detections import measure_detector
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.scoring.run import fill
 from lidar_perception.training.record import round_metrics, select_metrics
@@ -47,7 +47,7 @@ def evaluate_weights(weights: Path, folder: Path) -> dict[str, Any]:
     """Return the results of `evaluate detection` as JSON data."""
     report = DetectionReport()
     open_ = partial(open_detector, weights, min_score=MIN_SCORE)
-    fill(report, open_recording(folder), by_detector(open_))
+    fill(report, open_recording(folder), measure_detector(open_))
     return report.compute()
 
 

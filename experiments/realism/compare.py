@@ -34,7 +34,7 @@ from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.matching import RANGE_NAMES
-from lidar_perception.scoring.centres.report import CandidateReport, of_frame
+from lidar_perception.scoring.centres.report import CandidateReport, measure_frame
 from lidar_perception.types import InputError
 
 MAX_SCANS = 500  # of a folder that are compared; of a larger one, evenly spread
@@ -72,7 +72,7 @@ class Measured:
             for name in truth.labels:
                 if name in CLASSES:
                     self.objects[name] += 1
-            result = of_frame(frame, protocol)
+            result = measure_frame(frame, protocol)
             if result is not None:
                 self.report.update(result)
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from experiments.realism.compare import MIN_SAMPLES, factor_off
 from experiments.realism.scan_statistics import CURVES
 from lidar_perception.scoring.pictures import save_picture
-from lidar_perception.scoring.tables import narrow_table, number, print_skipped
+from lidar_perception.scoring.tables import format_number, make_table, print_skipped
 
 WORST = 25
 REAL, SIMULATED, WRONG = "#0072b2", "#d55e00", "#b00000"
@@ -43,14 +43,14 @@ def typical_factor(curve: dict) -> float | None:
 
 
 def _print_curves(content: dict, console: Console) -> None:
-    table = narrow_table("Simulated against real, worst curves first",
+    table = make_table("Simulated against real, worst curves first",
                    "curve", "within 20 %", "typical", "worst at", "ratio")
     judged = [c for c in content["curves"].values() if c["judged"]]
     for curve in sorted(judged, key=lambda c: (c["share"], -(typical_factor(c) or 0.0))):
         worst = max((b for b in curve["bins"] if b["within"] is not None), key=factor_off)
         table.add_row(_title(curve), f"{curve['within']} of {curve['judged']}",
-                      number(typical_factor(curve), width=9), worst["bin"],
-                      number(worst["ratio"], width=9))
+                      format_number(typical_factor(curve), width=9), worst["bin"],
+                      format_number(worst["ratio"], width=9))
     unknown = sum(not curve["judged"] and not CURVES[name].histogram
                   for name, curve in content["curves"].items())
     table.caption = ("typical: the median factor between simulated and real. ratio: simulated / "
@@ -62,12 +62,12 @@ def _print_curves(content: dict, console: Console) -> None:
 def _print_worst(content: dict, console: Console) -> None:
     bins = [(curve, b) for curve in content["curves"].values() for b in curve["bins"]
             if b["within"] is False]
-    table = narrow_table(f"The {min(WORST, len(bins))} worst bins of {len(bins)} not within 20 %",
+    table = make_table(f"The {min(WORST, len(bins))} worst bins of {len(bins)} not within 20 %",
                    "curve", "bin", "real", "10..90 %", "n", "sim.", "10..90 %", "n", "ratio")
     for curve, b in sorted(bins, key=lambda item: -factor_off(item[1]))[:WORST]:
         table.add_row(_title(curve), b["bin"],
                       *(cell for side in ("real", "simulated") for cell in _cells(b[side])),
-                      number(b["ratio"], width=9))
+                      format_number(b["ratio"], width=9))
     table.caption = "Median and spread of the scans or objects, n of them."
     if bins:
         console.print(table)

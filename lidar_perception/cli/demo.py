@@ -49,7 +49,7 @@ from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console, errors, show_progress
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.tables import print_candidate_report
-from lidar_perception.scoring.recorded import Answered, answered
+from lidar_perception.scoring.recorded import RecordedResult, read_results
 from lidar_perception.tracking.ego import NO_SOURCE
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError, class_ids
 from lidar_perception.wire.messages import read_column, to_detections, to_point_cloud, to_truth
@@ -129,7 +129,7 @@ def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: i
     content = replay(drive, clouds, out, own, detector=detector, rate=rate, single=single,
                      real_time=real_time)
     final = list_result_topics(single, detector)[FINAL]
-    found, tracks = answered(out / "result", final, TRACKS)
+    found, tracks = read_results(out / "result", final, TRACKS)
     calibration = next(iter(played)).calibration()
     if detector == CANDIDATES:
         print_candidate_report(content, console)
@@ -199,17 +199,17 @@ def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
     return path
 
 
-def _print_detections(frames: Sequence[Answered], calibration: Any) -> dict:
+def _print_detections(frames: Sequence[RecordedResult], calibration: Any) -> dict:
     """Print and return the detection scores by class, for labels in the camera's view."""
-    from lidar_perception.scoring.detections import Detected
-    from lidar_perception.scoring.kitti.in_use import in_use, print_in_use
+    from lidar_perception.scoring.detections import FrameDetections
+    from lidar_perception.scoring.kitti.in_use import print_scores_at_threshold, score_at_threshold
     from lidar_perception.scoring.kitti.report import DetectionReport
     report = DetectionReport()
     for frame in frames:
-        report.update(Detected(str(frame.stamp_ns), to_truth(frame.truth),
-                               to_detections(frame.found), calibration))
-    scores = in_use(report.frames)
-    print_in_use(scores, len(frames), console)
+        report.update(FrameDetections(str(frame.stamp_ns), to_truth(frame.truth),
+                                      to_detections(frame.found), calibration))
+    scores = score_at_threshold(report.frames)
+    print_scores_at_threshold(scores, len(frames), console)
     return scores
 
 
@@ -222,11 +222,11 @@ def _print_pace(content: dict, rate: float, clouds: int) -> None:
                   f"{latency['p95']:.0f} ms; memory of the graph {content['memory_mb']:.0f} MB")
 
 
-def _print_tracks(frames: Sequence[Answered], calibration: Any, poses: str) -> dict:
+def _print_tracks(frames: Sequence[RecordedResult], calibration: Any, poses: str) -> dict:
     """Print and return the scores of the tracks by class, and the source of the poses."""
-    from lidar_perception.scoring.tracking.from_bag import recorded_tracks
-    from lidar_perception.scoring.tracking.tables import EGO
-    result = recorded_tracks(frames, calibration)
+    from lidar_perception.scoring.tracking.from_bag import score_recorded_tracks
+    from lidar_perception.scoring.tracking.tables import EGO_TITLES
+    result = score_recorded_tracks(frames, calibration)
     for name in DETECTED:
         scores, count = result.scores.get(name), result.count.get(name, 0)
         if scores:
@@ -237,11 +237,11 @@ def _print_tracks(frames: Sequence[Answered], calibration: Any, poses: str) -> d
     if result.problem:
         console.print(f"tracks: {result.count}; HOTA is not known: {result.problem}")
     remedy = "; pip install 'lidar_perception[odometry]' takes them from the scans"
-    console.print(f"tracks are with {EGO[poses]}{remedy * (poses == NO_SOURCE)}")
+    console.print(f"tracks are with {EGO_TITLES[poses]}{remedy * (poses == NO_SOURCE)}")
     return {"found": result.count, "scores": result.scores}
 
 
-def _drawn(frames: Sequence[Answered], detector: str) -> dict[int, tuple[np.ndarray, Any]]:
+def _drawn(frames: Sequence[RecordedResult], detector: str) -> dict[int, tuple[np.ndarray, Any]]:
     """Return {stamp: (boxes of labels, detected objects)} of the classes that are detected."""
     wanted = {CLASSES[PEDESTRIAN]} if detector == CANDIDATES else {*DETECTED}
     return {f.stamp_ns: (f.truth.boxes[[label in wanted for label in f.truth.labels]], f.found)

@@ -153,10 +153,10 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
 
 def print_summary(summary: Summary, run: Run) -> None:
     """Print counts of boxes, the paths of the results, and the problems of the run."""
-    from lidar_perception.scoring.tables import narrow_table, print_skipped, print_time
+    from lidar_perception.scoring.tables import make_table, print_skipped, print_time
     content = summary.compute()
-    table = narrow_table(f"{content['frames']} frames of {run.recording.path}", "class", "boxes",
-                         "a frame", width=7)
+    table = make_table(f"{content['frames']} frames of {run.recording.path}", "class", "boxes",
+                       "a frame", width=7)
     for name, count in sorted(content["boxes"].items(), key=lambda item: -item[1]):
         table.add_row(name, str(count), f"{count / content['frames']:.1f}")
     table.add_row("all", str(sum(content["boxes"].values())), "")

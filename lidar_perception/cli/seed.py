@@ -19,7 +19,7 @@ from lidar_perception.cli.data import as_mounted, data_argument, opened, out_fil
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.runs.terminal import console
-from lidar_perception.scoring.centres.report import pedestrians_of
+from lidar_perception.scoring.centres.report import load_pedestrians
 from lidar_perception.types import InputError
 from lidar_perception.wire.params import ViewParams
 
@@ -50,7 +50,7 @@ def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, 
         params = replace(params, view=ViewParams(enabled=False))
     segmented = segment_cloud(frame.load(), camera, params)
     source = (make_click_source(np.array(at), params.seed) if at is not None
-              else make_truth_source(pedestrians_of(frame, params.view.enabled)))
+              else make_truth_source(load_pedestrians(frame, params.view.enabled)))
     template = source(segmented)
     save_seed(template, out)
     for row in to_pixels(template.silhouette(params))[::2]:
@@ -64,7 +64,7 @@ def _pick(recording: Recording, number: int | None, view: ViewParams,
         if i == number:
             return frame
         with suppress(InputError):
-            if number is None and (not labelled or len(pedestrians_of(frame, view.enabled))):
+            if number is None and (not labelled or len(load_pedestrians(frame, view.enabled))):
                 return frame
     raise InputError(f"{recording.path} has no frame {number}; it has {len(recording)}"
                      if number is not None else

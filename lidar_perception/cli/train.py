@@ -197,9 +197,9 @@ def run(trainer: Any, request: TrainingRequest, params: Any) -> None:
 
 def print_fused(fits: Any) -> None:
     """Print the fit of each class."""
-    from lidar_perception.scoring.tables import narrow_table
-    table = narrow_table("Curves, on scans that they were not fitted to", "", "proposals", "right",
-                         ">= 0.4", "right", "log loss")
+    from lidar_perception.scoring.tables import make_table
+    table = make_table("Curves, on scans that they were not fitted to", "", "proposals", "right",
+                       ">= 0.4", "right", "log loss")
     few = []
     for name, own in fits.items():
         rows = [("package", own.before)]

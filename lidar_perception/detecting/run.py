@@ -23,7 +23,7 @@ from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import ConfigurableDetector, resolve_weights
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.journal import open_journal
-from lidar_perception.scoring.run import complete, fill
+from lidar_perception.scoring.run import fill, fill_journal
 from lidar_perception.tracking.drive_tracker import DriveTracker
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import CLASSES
@@ -113,8 +113,8 @@ def detect(run: Run, open_: Callable[[], Detector], formats: Sequence[Callable[[
     tracker = None if tracking is None else partial(DriveTracker, params=tracking, ego=ego)
     with open_journal(run.out, run.header, force=force, list_files=written) as done:
         names = [frame.name for frame in islice(recording, run.count)]
-        complete(done, recording, by_detector(open_), names, jobs=jobs, dask=dask,
-                 title="detecting")
+        fill_journal(done, recording, by_detector(open_), names, jobs=jobs, dask=dask,
+                     title="detecting")
         done.sort(names)
 
         def record_of(name: str) -> Any:

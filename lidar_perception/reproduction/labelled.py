@@ -15,7 +15,7 @@ from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.params import set_sensor_height
-from lidar_perception.scoring.kitti.camera_objects import in_image
+from lidar_perception.scoring.kitti.camera_objects import select_in_image
 from lidar_perception.types import (
     CLASSES,
     PEDESTRIAN,
@@ -59,7 +59,7 @@ def load_labelled(frame: Frame) -> Labelled:
     scan, calibration = frame.load(), frame.calibration()
     if calibration is None:
         raise InputError(f"{frame.name} has no camera calibration, to whose view the paper crops")
-    truth, camera = in_image(truth, calibration), calibration.camera()
+    truth, camera = select_in_image(truth, calibration), calibration.camera()
     if PEDESTRIAN not in truth.class_ids:
         raise InputError("no Pedestrian is labelled in the image; the paper leaves such frames out")
     if not camera.in_view(scan.xyz).any():

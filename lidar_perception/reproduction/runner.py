@@ -17,7 +17,7 @@ from lidar_perception.reproduction.experiment import Experiment
 from lidar_perception.reproduction.report_files import written
 from lidar_perception.runs.journal import open_journal
 from lidar_perception.runs.resuming import hash_names
-from lidar_perception.scoring.run import complete
+from lidar_perception.scoring.run import fill_journal
 
 
 def run(experiment: Experiment, recording: Recording, out: Path, *, jobs: int = 1,
@@ -38,8 +38,8 @@ def run(experiment: Experiment, recording: Recording, out: Path, *, jobs: int = 
             "frame_names": hash_names(names),
             "settings": experiment.settings}
     with open_journal(out, plan, force=force, list_files=written) as done, threadpool_limits(1):
-        complete(done, recording, functools.partial(_measurer, experiment), names[:limit],
-                 jobs=jobs, dask=dask, title=experiment.name)
+        fill_journal(done, recording, functools.partial(_measurer, experiment), names[:limit],
+                     jobs=jobs, dask=dask, title=experiment.name)
         done.sort(names)
         records = [json.loads(done.lines[name]) for name in names[:limit]]
     lost = recording.missing_scans if limit is None else ()

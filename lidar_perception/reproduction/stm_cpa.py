@@ -24,9 +24,9 @@ from lidar_perception.reproduction.params import StmCpaParams
 from lidar_perception.reproduction.stm_cpa_tables import sections
 from lidar_perception.scoring.centres.matching import (
     RANGE_NAMES,
-    counts_by_range,
+    count_by_range,
+    find_range_bins,
     match_centres,
-    range_bins,
 )
 from lidar_perception.types import InputError
 
@@ -95,7 +95,7 @@ def search(segmented: SegmentedCloud, seed: Seed | None,
             if seed is not None:
                 found = _clusters(segmented, plane, seed, eps, min_samples)
             pairs = match_centres(found, truth, NUMBERS.search_distance)
-            tp, fp, *_ = counts_by_range(found, truth, pairs)
+            tp, fp, *_ = count_by_range(found, truth, pairs)
             counts.append([tp.tolist(), fp.tolist()])
     return counts
 
@@ -114,7 +114,7 @@ def stage_counts(found: np.ndarray, truth: np.ndarray, before: np.ndarray) -> di
     """tp, fp, fn, error (sum of centre errors, m) and kept by range: kept are the pedestrians that
     are hit by one of the boxes found (K, 7) and by one of those `before` (L, 7)."""
     pairs = match_centres(found, truth)
-    tp, fp, fn, error = counts_by_range(found, truth, pairs)
+    tp, fp, fn, error = count_by_range(found, truth, pairs)
     kept = np.intersect1d(pairs[1], match_centres(before, truth)[1])
     return {"tp": tp.tolist(), "fp": fp.tolist(), "fn": fn.tolist(),
             "kept": _by_range(truth[kept]), "error": np.round(error, 6).tolist()}
@@ -136,7 +136,7 @@ def _refined(segmented: SegmentedCloud, seed: Seed, params: PipelineParams) -> C
 
 
 def _by_range(boxes: np.ndarray) -> list[int]:
-    return np.bincount(range_bins(boxes), minlength=len(RANGE_NAMES)).tolist()
+    return np.bincount(find_range_bins(boxes), minlength=len(RANGE_NAMES)).tolist()
 
 
 STM_CPA = Experiment(

@@ -29,7 +29,7 @@ from lidar_perception.reproduction.experiment import (
 )
 from lidar_perception.reproduction.labelled import Labelled, load_labelled, nearest_seed
 from lidar_perception.reproduction.statistics import bootstrap, cells, curve, rates, stack
-from lidar_perception.scoring.centres.matching import RANGE_NAMES, counts_by_range, match_centres
+from lidar_perception.scoring.centres.matching import RANGE_NAMES, count_by_range, match_centres
 from lidar_perception.types import InputError
 
 SHOWN = RANGE_NAMES[:4]  # beyond 60 m there is hardly anything to score
@@ -93,7 +93,7 @@ def score(found: Found, truth: np.ndarray) -> dict[str, list]:
         found = Found(np.delete(found.boxes, own, axis=0), np.delete(found.scores, own),
                       found.threshold)
     accepted = found.accepted
-    counts = counts_by_range(accepted, truth, match_centres(accepted, truth))
+    counts = count_by_range(accepted, truth, match_centres(accepted, truth))
     return {**{name: count.tolist() for name, count in zip(COUNTS, counts)},
             "ranked": ranked(found.boxes, found.scores, truth)}
 

@@ -15,17 +15,17 @@ from __future__ import annotations
 import numpy as np
 
 STEPS = 40            # between recall 0 and 1
-FEW = STEPS + 1       # objects needed to fill all points
+MIN_OBJECTS = STEPS + 1       # objects needed to fill all points
 
 
-def recall_thresholds(scores: np.ndarray, objects: int) -> np.ndarray:
+def choose_thresholds(scores: np.ndarray, objects: int) -> np.ndarray:
     """(T,) descending scores to take precision at: of the scores (N,) of true positives those
     whose recall is nearest to 0, 1/40, .. 1; all of them where objects < FEW.
 
     objects is how many there are to find, at least N.
     """
     ordered = np.sort(scores)[::-1]
-    if objects < FEW or len(ordered) == 0:
+    if objects < MIN_OBJECTS or len(ordered) == 0:
         return ordered
     chosen, wanted = [], 0.0
     for i in range(len(ordered)):
@@ -33,24 +33,24 @@ def recall_thresholds(scores: np.ndarray, objects: int) -> np.ndarray:
         if i + 1 == len(ordered) or following - wanted >= wanted - recall:
             chosen.append(i)
             wanted += 1 / STEPS
-    return ordered[chosen[:FEW]]
+    return ordered[chosen[:MIN_OBJECTS]]
 
 
-def at_recall(values: np.ndarray, objects: int, official: bool = False) -> np.ndarray:
+def sample_curve(values: np.ndarray, objects: int, official: bool = False) -> np.ndarray:
     """(41,) the best of values (T,), taken at recall_thresholds, at recall 0, 1/40, .. 1 or beyond;
     0 where it is not reached."""
     best = np.maximum.accumulate(values[::-1])[::-1]
-    curve = np.zeros(FEW)
-    if objects >= FEW or official:
+    curve = np.zeros(MIN_OBJECTS)
+    if objects >= MIN_OBJECTS or official:
         curve[:len(best)] = best
         return curve
     # The first true positive with which that recall is reached.
-    index = np.maximum((np.arange(FEW) * objects + STEPS - 1) // STEPS - 1, 0)
+    index = np.maximum((np.arange(MIN_OBJECTS) * objects + STEPS - 1) // STEPS - 1, 0)
     reached = index < len(best)
     curve[reached] = best[index[reached]]
     return curve
 
 
-def averages(curve: np.ndarray) -> tuple[float, float]:
+def average_curve(curve: np.ndarray) -> tuple[float, float]:
     """Percent at 11 and at 40 recall points of a curve (41,)."""
     return 100 * float(curve[::4].mean()), 100 * float(curve[1:].mean())

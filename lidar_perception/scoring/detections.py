@@ -20,58 +20,61 @@ from lidar_perception.data.kitti.results import (
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.runs import journal
 from lidar_perception.scoring.run import Start
-from lidar_perception.scoring.thinning import thinned
+from lidar_perception.scoring.thinning import thin_points
 from lidar_perception.types import Detections, GroundTruth, InputError, RunError
 
-Boxes = TypeVar("Boxes", bound=Detections | GroundTruth)
+BoxesT = TypeVar("BoxesT", bound=Detections | GroundTruth)
 
 
 @dataclass(frozen=True)
-class Detected(Generic[Boxes]):
+class FrameDetections(Generic[BoxesT]):
     """One frame. detections: of a detector, or labels with a score in extras (a result file); ms:
     of the detector, None where none ran; problem: why it refused the frame, whose objects are then
     missed, or None. truth is None where the frame has no labels, calibration without a camera."""
 
     name: str
     truth: GroundTruth | None
-    detections: Boxes
+    detections: BoxesT
     calibration: Calibration | None = None
     ms: float | None = None
     problem: str | None = None
 
 
-def detected(detector: Detector, frame: Frame, truth: GroundTruth | None,
-             calibration: Calibration | None, keep: float = 1.0) -> Detected[Detections]:
+def run_detector(detector: Detector, frame: Frame, truth: GroundTruth | None,
+                 calibration: Calibration | None, keep: float = 1.0) -> FrameDetections[Detections]:
     """Run a detector on a frame, of which it sees a share `keep` of the points. InputError where
     the scan cannot be read."""
-    scan = thinned(frame.load(), keep, frame.name)
+    scan = thin_points(frame.load(), keep, frame.name)
     begin = perf_counter()
     try:
         found = detector(scan)
     except RunError:
         raise
     except InputError as error:
-        return Detected(frame.name, truth, Detections.none(), calibration, problem=str(error))
-    return Detected(frame.name, truth, found.detections, calibration,
-                    (perf_counter() - begin) * 1e3)
+        return FrameDetections(
+            frame.name, truth, Detections.none(), calibration, problem=str(error)
+        )
+    return FrameDetections(frame.name, truth, found.detections, calibration,
+                           (perf_counter() - begin) * 1e3)
 
 
-def by_detector(open_: Callable[[], Detector], keep: float = 1.0, folder: Path | None = None
-                ) -> Start:
+def measure_detector(open_: Callable[[], Detector], keep: float = 1.0, folder: Path | None = None
+                     ) -> Start:
     """Runs the detector that open_() gives on every frame with labels; with a folder on all frames,
     and writes what it says there as KITTI result files. It sees a share `keep` of the points."""
-    return partial(_by_detector, open_, keep, folder)
+    return partial(_measure_detector, open_, keep, folder)
 
 
-def _by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None,
-                 recording: Recording) -> Callable[[Frame], Detected[Detections] | None]:
+def _measure_detector(
+    open_: Callable[[], Detector], keep: float, folder: Path | None, recording: Recording
+) -> Callable[[Frame], FrameDetections[Detections] | None]:
     detector = open_()
 
-    def measure(frame: Frame) -> Detected[Detections] | None:
+    def measure(frame: Frame) -> FrameDetections[Detections] | None:
         truth, calibration = frame.truth(), frame.calibration()
         if truth is None and folder is None:
             return None
-        result = detected(detector, frame, truth, calibration, keep)
+        result = run_detector(detector, frame, truth, calibration, keep)
         if folder is not None:
             try:
                 write_results(folder / f"{frame.name}.txt", result.detections,
@@ -82,15 +85,15 @@ def _by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None
     return measure
 
 
-def by_files(folder: Path, recording: Recording
-             ) -> Callable[[Frame], Detected[GroundTruth] | None]:
+def measure_result_files(folder: Path, recording: Recording
+                         ) -> Callable[[Frame], FrameDetections[GroundTruth] | None]:
     """Read KITTI result files, folder/NAME.txt, of every frame with labels. folder may be that of a
     run of `detect`; frames that the run skipped are skipped. With a folder a Start of
     scoring.run."""
     files = find_result_folder(folder)
     skipped = journal.read_skipped_frames(files.parent)
 
-    def measure(frame: Frame) -> Detected[GroundTruth] | None:
+    def measure(frame: Frame) -> FrameDetections[GroundTruth] | None:
         truth, calibration = frame.truth(), frame.calibration()
         if truth is None:
             return None
@@ -101,5 +104,5 @@ def by_files(folder: Path, recording: Recording
                                  choose_calibration(frame)[0].lidar_to_camera)
         except InputError as error:
             raise RunError(str(error)) from None
-        return Detected(frame.name, truth, found, calibration)
+        return FrameDetections(frame.name, truth, found, calibration)
     return measure

@@ -11,40 +11,45 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-DRIVES, RUN = 8, 10
-SHARE = 90  # percent of the resamplings that lie within an interval
+MIN_DRIVES, BLOCK_FRAMES = 8, 10
+INTERVAL_PERCENT = 90  # percent of the resamplings that lie within an interval
 
 
-def blocks(names: Sequence[str], follow: bool = False) -> list[np.ndarray]:
+def group_frames(names: Sequence[str], follow: bool = False) -> list[np.ndarray]:
     """Indices of the frames with these names that belong together, DRIVE/FRAME. Frames without a
     drive are one drive where they follow each other, as in a bag; else each is one of its own, as
     in KITTI's object layout."""
     drives: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         drives.setdefault(name.rpartition("/")[0] or ("" if follow else f"/{i}"), []).append(i)
-    if len(drives) >= DRIVES:
+    if len(drives) >= MIN_DRIVES:
         return [*map(np.array, drives.values())]
-    return [np.array(frames[i:i + RUN]) for frames in drives.values()
-            for i in range(0, len(frames), RUN)]
+    return [np.array(frames[i:i + BLOCK_FRAMES]) for frames in drives.values()
+            for i in range(0, len(frames), BLOCK_FRAMES)]
 
 
-def interval(score: Callable[[np.ndarray], float | None], parts: Sequence[np.ndarray], count: int
-             ) -> list[float] | None:
+def compute_interval(
+    score: Callable[[np.ndarray], float | None], parts: Sequence[np.ndarray], count: int
+) -> list[float] | None:
     """[low, high] of what score(frames) gives for `count` drawings of these parts; frames (F,) are
     indices. None where fewer than two parts were drawn from, or no drawing has a score."""
-    return bounds(score(frames) for frames in drawings(parts, count))
+    return compute_bounds(score(frames) for frames in draw_samples(parts, count))
 
 
-def drawings(parts: Sequence[np.ndarray], count: int) -> Iterator[np.ndarray]:
+def draw_samples(parts: Sequence[np.ndarray], count: int) -> Iterator[np.ndarray]:
     """(F,) indices of frames, `count` times, always the same; none of fewer than two parts."""
     rng = np.random.default_rng(0)
     for _ in range(count if len(parts) > 1 else 0):
         yield np.concatenate([parts[i] for i in rng.integers(len(parts), size=len(parts))])
 
 
-def bounds(scores: Iterable[float | None]) -> list[float] | None:
+def compute_bounds(scores: Iterable[float | None]) -> list[float] | None:
     """[low, high] that hold SHARE percent of the scores; None where there is none."""
     found = [score for score in scores if score is not None]
     if not found:
         return None
-    return np.percentile(found, [(100 - SHARE) / 2, (100 + SHARE) / 2]).round(2).tolist()
+    return (
+        np.percentile(found, [(100 - INTERVAL_PERCENT) / 2, (100 + INTERVAL_PERCENT) / 2])
+        .round(2)
+        .tolist()
+    )

@@ -32,7 +32,7 @@ from lidar_perception.types import InputError, RunError
 Start = Callable[[Recording], Callable[[Frame], Any]]
 
 CONNECT_S = 20.0  # for a Dask scheduler to answer and a first worker to come
-AHEAD = 2         # futures in flight for each thread of a Dask cluster
+TASKS_PER_THREAD = 2         # futures in flight for each thread of a Dask cluster
 
 
 class Report(Protocol):
@@ -57,7 +57,7 @@ def fill(report: Report, recording: Recording, start: Start, *, limit: int | Non
     of all, labels whose scan is lost are skipped by name, too. InputError if a process or a cluster
     fails."""
     count = min(len(recording), limit or len(recording))
-    found = results(recording, start, range(count), jobs=jobs, dask=dask)
+    found = measure_frames(recording, start, range(count), jobs=jobs, dask=dask)
     with closing(found):
         for _, result in show_progress(found, title, count):
             if isinstance(result, Skipped):
@@ -68,22 +68,22 @@ def fill(report: Report, recording: Recording, start: Start, *, limit: int | Non
         report.skipped.extend(reason for _, reason in recording.missing_scans)
 
 
-def complete(journal: Journal, recording: Recording, start: Start, names: Sequence[str], *,
-             jobs: int = 1, dask: str | None = None, title: str) -> None:
+def fill_journal(journal: Journal, recording: Recording, start: Start, names: Sequence[str], *,
+                 jobs: int = 1, dask: str | None = None, title: str) -> None:
     """Measure the first frames of a recording, which have these names, and add each to the journal
     as soon as it is done, unless it is there already. measure() gives a JSON object with the
     frame's name under "frame"; of a frame that was skipped the journal has {"frame": name,
     "skipped": reason}. InputError if a process or a cluster fails."""
     missing = [i for i, name in enumerate(names) if name not in journal.lines]
-    found = results(recording, start, missing, jobs=jobs, dask=dask)
+    found = measure_frames(recording, start, missing, jobs=jobs, dask=dask)
     with closing(found):
         for i, line in show_progress(found, title, len(missing)):
             journal.add(json.dumps({"frame": names[i], "skipped": str(line)})
                         if isinstance(line, Skipped) else line)
 
 
-def results(recording: Recording, start: Start, numbers: Sequence[int] | None = None, *,
-            jobs: int = 1, dask: str | None = None) -> Generator[tuple[int, Any]]:
+def measure_frames(recording: Recording, start: Start, numbers: Sequence[int] | None = None, *,
+                   jobs: int = 1, dask: str | None = None) -> Generator[tuple[int, Any]]:
     """(i, what measure gave for frame i, or Skipped) of the frames with these numbers, ascending,
     or of all, in their order.
 
@@ -93,15 +93,15 @@ def results(recording: Recording, start: Start, numbers: Sequence[int] | None = 
     """
     numbers = range(len(recording)) if numbers is None else numbers
     if dask is not None:
-        return in_order(_on_dask(dask, recording, start, numbers), numbers)
+        return sort_results(_measure_on_dask(dask, recording, start, numbers), numbers)
     if jobs > 1 and len(numbers) > 1:
-        work = functools.partial(_worker, _reopening(recording), start)
-        return in_order(run_in_processes(work, numbers, jobs, "measured frames"), numbers)
-    return _here(recording, start, numbers)
+        work = functools.partial(_make_worker, _require_reopen(recording), start)
+        return sort_results(run_in_processes(work, numbers, jobs, "measured frames"), numbers)
+    return _measure_in_process(recording, start, numbers)
 
 
-def in_order(pairs: Iterable[tuple[int, Any]], numbers: Sequence[int]
-             ) -> Generator[tuple[int, Any]]:
+def sort_results(pairs: Iterable[tuple[int, Any]], numbers: Sequence[int]
+                 ) -> Generator[tuple[int, Any]]:
     """The pairs (number, value) in the order of these numbers, each as soon as it can be."""
     waiting: dict[int, Any] = {}
     wanted = iter(numbers)
@@ -113,15 +113,15 @@ def in_order(pairs: Iterable[tuple[int, Any]], numbers: Sequence[int]
             following = next(wanted, None)
 
 
-def _here(recording: Recording, start: Start,
-          numbers: Sequence[int]) -> Generator[tuple[int, Any]]:
+def _measure_in_process(recording: Recording, start: Start,
+                        numbers: Sequence[int]) -> Generator[tuple[int, Any]]:
     measure, wanted = start(recording), set(numbers)
     for i, frame in enumerate(islice(recording, max(wanted, default=-1) + 1)):
         if i in wanted:
-            yield i, _measured(measure, frame)
+            yield i, _measure_safely(measure, frame)
 
 
-def _measured(measure: Callable[[Frame], Any], frame: Frame) -> Any:
+def _measure_safely(measure: Callable[[Frame], Any], frame: Frame) -> Any:
     try:
         return measure(frame)
     except RunError:
@@ -133,32 +133,34 @@ def _measured(measure: Callable[[Frame], Any], frame: Frame) -> Any:
         raise
 
 
-def _reopening(recording: Recording) -> Callable[[], Recording]:
+def _require_reopen(recording: Recording) -> Callable[[], Recording]:
     if recording.reopen is None:
         raise InputError(f"{recording.path} cannot be opened by other processes; use one job")
     return recording.reopen
 
 
-def _worker(reopen: Callable[[], Recording], start: Start) -> Callable[[int], tuple[int, Any]]:
+def _make_worker(reopen: Callable[[], Recording], start: Start) -> Callable[[int], tuple[int, Any]]:
     """What takes the number of a frame to what is measured of it, made in the process that will
     use it: frames are not sent to another."""
     recording = reopen()
     measure = start(recording)
-    return lambda i: (i, _measured(measure, recording.frames[i]))
+    return lambda i: (i, _measure_safely(measure, recording.frames[i]))
 
 
-_kept_open = functools.lru_cache(maxsize=1)(lambda run, reopen, start: _worker(reopen, start))
+_get_worker = functools.lru_cache(maxsize=1)(lambda run, reopen, start: _make_worker(reopen, start))
 
 
-def _on_cluster(run: str, reopen: Callable[[], Recording], start: Start, i: int) -> tuple[int, Any]:
+def _measure_on_cluster(
+    run: str, reopen: Callable[[], Recording], start: Start, i: int
+) -> tuple[int, Any]:
     """As a worker, in a process that may serve other runs before and after."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # for libraries that are loaded later
     with threadpool_limits(1):
-        return _kept_open(run, reopen, start)(i)
+        return _get_worker(run, reopen, start)(i)
 
 
-def _on_dask(address: str, recording: Recording, start: Start,
-             numbers: Sequence[int]) -> Iterator[tuple[int, Any]]:
+def _measure_on_dask(address: str, recording: Recording, start: Start,
+                     numbers: Sequence[int]) -> Iterator[tuple[int, Any]]:
     """As the workers of a Dask cluster finish them."""
     try:
         import distributed
@@ -166,7 +168,7 @@ def _on_dask(address: str, recording: Recording, start: Start,
     except ImportError:
         raise InputError("--dask needs the package distributed; pip install "
                          "'lidar_perception[distributed]'") from None
-    work = functools.partial(_on_cluster, uuid4().hex, _reopening(recording), start)
+    work = functools.partial(_measure_on_cluster, uuid4().hex, _require_reopen(recording), start)
     try:
         client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
         client.wait_for_workers(1, timeout=CONNECT_S)
@@ -174,7 +176,7 @@ def _on_dask(address: str, recording: Recording, start: Start,
         raise InputError(f"cannot reach a Dask scheduler with workers at {address}: "
                          f"{str(error) or repr(error)}") from None
     with client:
-        ahead = AHEAD * sum(client.nthreads().values())
+        ahead = TASKS_PER_THREAD * sum(client.nthreads().values())
         waiting = iter(numbers)
         running = distributed.as_completed(client.map(work, [*islice(waiting, ahead)], pure=False),
                                            loop=client.loop)

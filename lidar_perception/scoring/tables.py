@@ -9,10 +9,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-SHOWN = 5  # reasons why frames were skipped
+MAX_SHOWN = 5  # reasons why frames were skipped
 
 
-def narrow_table(title: str, first: str, *others: str, width: int = 0) -> Table:
+def make_table(title: str, first: str, *others: str, width: int = 0) -> Table:
     """A table whose columns fit into 80 characters: the first one of words, which are folded on a
     narrow terminal, the others, each at least `width` wide, of numbers."""
     table = Table(title=title, box=SIMPLE_HEAD, padding=0, caption_justify="left")
@@ -22,22 +22,22 @@ def narrow_table(title: str, first: str, *others: str, width: int = 0) -> Table:
     return table
 
 
-def number(value: float | None, digits: int = 2, width: int = 5) -> str:
+def format_number(value: float | None, digits: int = 2, width: int = 5) -> str:
     """In at most width characters: 84.00, 100.0; a dash for None and infinity."""
     return "-" if value is None or math.isinf(value) else f"{value:.{digits}f}"[:width].rstrip(".")
 
 
-def between(interval: list[float] | None) -> str:
+def format_interval(interval: list[float] | None) -> str:
     """44-89; a dash for none."""
     return "-" if interval is None else "-".join(f"{value:.0f}" for value in interval)
 
 
-def percent(row: dict, *keys: str) -> list[str]:
+def format_percent(row: dict, *keys: str) -> list[str]:
     """Shares of a row of scores, 0 .. 1, in percent."""
     return [f"{100 * row[key]:.1f}" for key in keys]
 
 
-def counts(row: dict, *keys: str) -> list[str]:
+def format_counts(row: dict, *keys: str) -> list[str]:
     """Whole numbers of a row of scores."""
     return [str(row[key]) for key in keys]
 
@@ -50,8 +50,8 @@ def print_time(ms: float | None, console: Console) -> None:
 
 def print_skipped(lines: list[str], console: Console) -> None:
     """The first reasons why frames were left out."""
-    for line in lines[:SHOWN]:
+    for line in lines[:MAX_SHOWN]:
         console.print(Text("skipped", "yellow") + f": {line}")
-    if len(lines) > SHOWN:
+    if len(lines) > MAX_SHOWN:
         console.print(Text("skipped", "yellow")
-                      + f": {len(lines) - SHOWN} more, see the JSON file")
+                      + f": {len(lines) - MAX_SHOWN} more, see the JSON file")

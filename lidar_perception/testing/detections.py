@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidar_perception.geometry import iou_3d
-from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, one_to_one
+from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, assign_pairs
 from lidar_perception.types import CLASSES, InputError
 from msg_utils.detections import from_detection_array
 from msg_utils.markers import from_marker_array
@@ -101,7 +101,7 @@ def assert_detections(found: Any, expected: Any, *, max_distance: float = MAX_CE
         cost, close = 1 - overlap, (overlap >= min_iou) & (overlap > 0)
     if same_class:
         close &= np.array([[x == y for y in b.labels] for x in a.labels], bool).reshape(close.shape)
-    rows, columns = one_to_one(cost, close)
+    rows, columns = assign_pairs(cost, close)
     missing = sorted(set(range(len(b.boxes))) - set(columns.tolist()))
     extra = sorted(set(range(len(a.boxes))) - set(rows.tolist()))
     if len(missing) > max_missing or (max_extra is not None and len(extra) > max_extra):

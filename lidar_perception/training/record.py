@@ -21,7 +21,7 @@ from lidar_perception.detectors.checkpoint import (
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.terminal import errors
 from lidar_perception.scoring.kitti.protocol import Comparison
-from lidar_perception.scoring.kitti.reliability import lines
+from lidar_perception.scoring.kitti.reliability import fit_calibrations
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.data import Batches
 from lidar_perception.training.params import LoopParams
@@ -95,7 +95,7 @@ def round_metrics(metrics: dict[str, float]) -> dict[str, float | None]:
 def summarize_report(report: DetectionReport, score: str, classes: Sequence[str]) -> Validation:
     """Return metrics and calibration, as Task.validate does, of a network's own scores."""
     return (select_metrics(report.compute(), score, classes),
-            lines(Comparison.of(report.frames)) if report.frames else {})
+            fit_calibrations(Comparison.of(report.frames)) if report.frames else {})
 
 
 def select_metrics(content: dict[str, Any], score: str,

@@ -30,7 +30,7 @@ from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.param_fields import collect_fields, with_values
 from lidar_perception.runs.terminal import Terminal
-from lidar_perception.scoring.tables import narrow_table
+from lidar_perception.scoring.tables import make_table
 from lidar_perception.types import InputError, closest_name
 from lidar_perception.wire.topics import POINTS, TRUTH
 
@@ -183,8 +183,8 @@ def test_info_folds_names_on_a_narrow_terminal_and_breaks_nothing_elsewhere(bag,
 @pytest.mark.parametrize("wide", [False, True])
 def test_a_table_in_a_pipe_is_not_cut_whatever_its_width(wide, monkeypatch):
     monkeypatch.setenv("COLUMNS", "20")
-    table = narrow_table("a title that is wider than its table" * (1 + 20 * wide), "", "score",
-                         "another" * (1 + 30 * wide))
+    table = make_table("a title that is wider than its table" * (1 + 20 * wide), "", "score",
+                       "another" * (1 + 30 * wide))
     table.add_row("a name of a detector", "100.0", "200.0")
     pipe = Terminal(file=io.StringIO())
     pipe.print(table)

@@ -37,9 +37,9 @@ from lidar_perception.detectors import open as opening
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.open import LOAD
 from lidar_perception.labels.exchange import import_labels
-from lidar_perception.scoring.recorded import by_stamp
+from lidar_perception.scoring.recorded import read_objects_by_stamp
 from lidar_perception.scoring.run import fill
-from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, observe
+from lidar_perception.scoring.tracking.report import TrackingReport, measure_tracking, observe
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import Detections
 from lidar_perception.wire.topics import POINTS, TRUTH
@@ -141,7 +141,7 @@ def test_a_bag_holds_what_the_nodes_publish(drives, tmp_path, monkeypatch, cloud
     with Bag(out / "bag") as bag:
         assert bag.counts.get(POINTS, 0) == clouds * len(frames)
         for topic in "/made_detector/output/detections", "/tracker/output/tracks":
-            marked = by_stamp(bag, [topic])[topic]
+            marked = read_objects_by_stamp(bag, [topic])[topic]
             arrays = [from_detection_array(message) for _, _, message
                       in bag.messages([f"{topic}_3d"])]
             assert sorted(marked) == stamps == [array.stamp_ns for array in arrays]
@@ -227,7 +227,9 @@ def test_written_tracks_score_as_the_tracker_itself(drives, tmp_path, monkeypatc
     assert detect(monkeypatch, drives, "--out", tmp_path, "--format", "kitti", "--track",
                   "--ego", "none", "--force") == 0
     recording, itself, read = open_recording(drives), TrackingReport(), TrackingReport()
-    fill(itself, recording, by_tracker(lambda: MadeDetector().with_min_score(0.05), ego="none"))
+    fill(
+        itself, recording, measure_tracking(lambda: MadeDetector().with_min_score(0.05), ego="none")
+    )
     for frame in recording:
         if (truth := frame.truth()) is not None:
             found = read_tracking_results(tmp_path / f"kitti/{frame.sequence}.txt",

@@ -22,9 +22,9 @@ from lidar_perception.ground.params import ClothParams
 from lidar_perception.ground.patchwork import silence_stdout
 from lidar_perception.scoring.points.segmentation import (
     PROTOCOLS,
-    ground_counts,
-    ground_row,
-    true_ground,
+    count_ground,
+    select_true_ground,
+    to_ground_row,
 )
 
 pytestmark = pytest.mark.no_cover  # other tests cover these lines
@@ -237,6 +237,6 @@ def test_a_real_scan_is_segmented_as_well_as_by_csf():
     theirs[np.array(inside)] = True
     ours = segment_by_cloth(frame.xyz, params)
     for protocol in PROTOCOLS:
-        truth = true_ground(semantic, frame.xyz[:, 2], protocol)
-        our_f1, their_f1 = (ground_row(ground_counts(g, *truth))["f1"] for g in (ours, theirs))
+        truth = select_true_ground(semantic, frame.xyz[:, 2], protocol)
+        our_f1, their_f1 = (to_ground_row(count_ground(g, *truth))["f1"] for g in (ours, theirs))
         assert our_f1 > their_f1 - 0.01 and our_f1 > 0.95, protocol

@@ -35,11 +35,15 @@ from lidar_perception.scoring.centres import paper
 from lidar_perception.scoring.centres.matching import (
     RANGE_LIMITS,
     RANGE_NAMES,
-    counts_by_range,
+    count_by_range,
+    find_range_bins,
     match_centres,
-    range_bins,
 )
-from lidar_perception.scoring.centres.report import CandidateReport, by_pipeline, of_frame
+from lidar_perception.scoring.centres.report import (
+    CandidateReport,
+    measure_candidates,
+    measure_frame,
+)
 from lidar_perception.scoring.run import fill
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError
 
@@ -106,7 +110,7 @@ def test_frames_come_in_order_and_the_one_without_pedestrians_is_skipped(kitti, 
 def test_hits_and_misses_are_the_truth_in_every_part_of_a_record(kitti, measured):
     for frame, record in zip(open_recording(kitti).frames, measured):
         truth = load_labelled(frame).pedestrians
-        assert record["pedestrians"] == np.bincount(range_bins(truth), minlength=5).tolist()
+        assert record["pedestrians"] == np.bincount(find_range_bins(truth), minlength=5).tolist()
         for counts in (*record["stages"].values(), *record["cpa"]):
             assert np.add(counts["tp"], counts["fn"]).tolist() == record["pedestrians"]
             assert (np.array(counts["kept"]) <= counts["tp"]).all()
@@ -120,7 +124,7 @@ def test_hits_and_misses_are_the_truth_in_every_part_of_a_record(kitti, measured
 
 def test_the_stages_are_those_of_evaluate_candidates(kitti, measured):
     report = CandidateReport()
-    fill(report, open_recording(kitti), partial(by_pipeline, PAPER))
+    fill(report, open_recording(kitti), partial(measure_candidates, PAPER))
     assert report.frames == len(measured)
     for stage, score in report.scores.items():
         for key in ("tp", "fp", "fn"):
@@ -146,7 +150,7 @@ def test_a_low_sensor_stands_on_the_ground_of_evaluate_candidates(kitti):
     frames = [as_mounted_at(frame, 0.7) for frame in open_recording(kitti).frames[:2]]
     params, report = with_values(PAPER, {"ground.sensor_pose.height": 0.7}), CandidateReport()
     for frame in frames:
-        report.update(of_frame(frame, params))
+        report.update(measure_frame(frame, params))
     records = [measure(frames, i) for i in range(len(frames))]
     assert report.scores["stage1"].tp.sum() > 3
     for stage, score in report.scores.items():
@@ -168,7 +172,7 @@ def test_two_steps_of_cpa_are_the_final_stage_from_15_to_30_m(refined):
     compared = 0
     for _, segmented, seed, found in refined:
         sweep = of(segmented, seed, cpa_everywhere(2)).final.boxes
-        inside = [boxes[range_bins(boxes) == 1] for boxes in (sweep, found.final.boxes)]
+        inside = [boxes[find_range_bins(boxes) == 1] for boxes in (sweep, found.final.boxes)]
         np.testing.assert_array_equal(*inside)
         compared += len(inside[0])
     assert compared > 3
@@ -180,7 +184,7 @@ def test_the_search_at_the_papers_setting_is_stage_1(refined, measured):
     for (labelled, _, _, found), record in zip(refined, measured):
         boxes, truth = found.stage1.boxes, labelled.pedestrians
         pairs = match_centres(boxes, truth, NUMBERS.search_distance)
-        tp, fp, *_ = counts_by_range(boxes, truth, pairs)
+        tp, fp, *_ = count_by_range(boxes, truth, pairs)
         away = np.hypot(*np.concatenate([boxes, truth])[:, :2].T)
         for i, name in enumerate(RANGE_NAMES[:3]):
             limits = RANGE_LIMITS[max(i - 1, 0):i + 1]

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from lidar_perception.data.open import open_recording
-from lidar_perception.scoring.centres.report import pedestrians
+from lidar_perception.scoring.centres.report import select_pedestrians
 from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.testing.detections import assert_detections
 from lidar_perception.wire.codec import bag_message
@@ -195,7 +195,7 @@ def test_without_camera_and_seed_the_diagnostics_say_so_and_a_click_helps(
         peer.wait(lambda: found, "candidates")
         assert len(from_marker_array(found[-1])) == 0
 
-        people = pedestrians(next(iter(open_recording(drive_bag))).truth())
+        people = select_pedestrians(next(iter(open_recording(drive_bag))).truth())
         nearest = people[np.argmin(np.hypot(people[:, 0], people[:, 1]))]
         click = peer.advertise("/clicked_point", "geometry_msgs/msg/PointStamped")
         point = bag_message("geometry_msgs/msg/Point", x=nearest[0], y=nearest[1], z=nearest[2])

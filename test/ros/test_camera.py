@@ -16,7 +16,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.nodes.graph import SINGLE, STAGES
 from lidar_perception.nodes.runtime import LATCHED, SENSOR_DATA
 from lidar_perception.param_fields import flatten
-from lidar_perception.scoring.centres.report import pedestrians, seed_source
+from lidar_perception.scoring.centres.report import make_seed_source, select_pedestrians
 from lidar_perception.types import Detections
 from lidar_perception.wire.codec import encode
 from lidar_perception.wire.messages import to_detections
@@ -26,10 +26,10 @@ from msg_utils.stamps import to_ns
 
 
 def offline(frame):
-    people = pedestrians(frame.truth())
+    people = select_pedestrians(frame.truth())
     if not len(people):
         return Detections.none()
-    return find_candidates(frame.load(), seed_source(people, None, PAPER), frame.camera(),
+    return find_candidates(frame.load(), make_seed_source(people, None, PAPER), frame.camera(),
                            PAPER)[1].final
 
 

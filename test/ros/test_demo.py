@@ -22,7 +22,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.nodes.graph import FINAL, list_result_topics
 from lidar_perception.nodes.replay import graph_replay
-from lidar_perception.scoring.recorded import answered
+from lidar_perception.scoring.recorded import read_results
 from lidar_perception.types import InputError
 
 FRAMES = 4  # tracks are confirmed
@@ -35,7 +35,7 @@ def test_the_demo_scores_what_fused_finds_offline(drive_bag, make_bag, tmp_path)
     assert outcome.exit_code == 0, outcome.output
     scores = json.loads((tmp_path / "scores.json").read_text())
     frames = {frame.stamp_ns: frame for frame in open_recording(bag)}
-    found, = answered(tmp_path / "result", list_result_topics(True, "fused")[FINAL])
+    found, = read_results(tmp_path / "result", list_result_topics(True, "fused")[FINAL])
     assert {f.stamp_ns for f in found} == frames.keys() and scores["results"] == len(frames)
     torch.set_num_threads(len(os.sched_getaffinity(0)))  # sums depend on it; nodes take all cores
     fused = open_detector(sensor_height=next(iter(frames.values())).sensor_height)

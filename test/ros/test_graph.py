@@ -18,9 +18,9 @@ from lidar_perception.nodes.replay.graph_replay import replay
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.report import (
     CandidateReport,
-    of_frame,
-    pedestrians,
-    seed_source,
+    make_seed_source,
+    measure_frame,
+    select_pedestrians,
 )
 from lidar_perception.testing.processes import NodesUnderTest
 from lidar_perception.wire.messages import read_column, to_detections, to_point_cloud
@@ -61,11 +61,11 @@ def offline(setting, drive_bag):
     """Stamp -> what the offline pipeline finds; and its report."""
     report, results, params = CandidateReport(), {}, setting[1]
     for frame in open_recording(drive_bag):
-        people = pedestrians(frame.truth())
+        people = select_pedestrians(frame.truth())
         if len(people):
-            report.update(of_frame(frame, params))
+            report.update(measure_frame(frame, params))
             results[frame.stamp_ns] = find_candidates(
-                frame.load(), seed_source(people, None, params), frame.camera(), params)
+                frame.load(), make_seed_source(people, None, params), frame.camera(), params)
     return results, report
 
 

@@ -9,17 +9,19 @@ from hypothesis import strategies as st
 from scipy.special import expit, logit
 
 from lidar_perception.classes import CAR, DETECTED
-from lidar_perception.scoring.kitti.box_errors import ERRORS, RANGES, box_errors
-from lidar_perception.scoring.kitti.camera_objects import camera_objects, scored_labels
-from lidar_perception.scoring.kitti.protocol import Comparison, compared
-from lidar_perception.scoring.kitti.reliability import lines, reliability
+from lidar_perception.scoring.kitti.box_errors import ERRORS, RANGES, measure_box_errors
+from lidar_perception.scoring.kitti.camera_objects import to_camera_objects, to_scored_labels
+from lidar_perception.scoring.kitti.protocol import Comparison, compare_objects
+from lidar_perception.scoring.kitti.reliability import fit_calibrations, measure_reliability
 from lidar_perception.types import Detections, GroundTruth
 
 
 def frame(true: np.ndarray, found: np.ndarray, scores=0.9):
     truth = GroundTruth.of(true, np.full(len(true), CAR))
     detections = Detections.of(found, CAR, scores)
-    return compared(camera_objects(truth, None), camera_objects(scored_labels(detections), None))
+    return compare_objects(
+        to_camera_objects(truth, None), to_camera_objects(to_scored_labels(detections), None)
+    )
 
 
 def cars(count: int, rng) -> np.ndarray:
@@ -51,11 +53,11 @@ def test_scores_that_are_the_share_of_right_boxes_are_reliable_and_others_are_no
     share = rng.uniform(0.05, 1, 400)
     found = true.copy()
     found[rng.random(400) >= share] += [1e4, 0, 0, 0, 0, 0, 0]
-    honest, modest = (reliability(Comparison.of([frame(true, found, scores)]), "Car")
+    honest, modest = (measure_reliability(Comparison.of([frame(true, found, scores)]), "Car")
                       for scores in (share, 0.05 + share / 10))
     assert sum(row["boxes"] for row in honest["bins"]) == 400
     assert honest["error"] < 12 and modest["error"] > 30
-    assert reliability(Comparison.of([frame(true, found[:0])]), "Car")["error"] is None
+    assert measure_reliability(Comparison.of([frame(true, found[:0])]), "Car")["error"] is None
 
 
 @settings(max_examples=5)
@@ -68,16 +70,16 @@ def test_lines_give_back_what_scores_were_before_they_were_bent(seed):
     found = true.copy()
     found[rng.random(3000) >= share] += [1e6, 0, 0, 0, 0, 0, 0]
     bent = expit((logit(share) + 0.7) / 1.6)
-    slope, offset = lines(Comparison.of([frame(true[i::30], found[i::30], bent[i::30])
-                                         for i in range(30)]))["Car"]
+    slope, offset = fit_calibrations(Comparison.of([frame(true[i::30], found[i::30], bent[i::30])
+                                                    for i in range(30)]))["Car"]
     assert slope == pytest.approx(1.6, abs=0.25) and offset == pytest.approx(-0.7, abs=0.25)
-    assert lines(Comparison.of([frame(true[:5], found[:5], bent[:5])])) == {}
+    assert fit_calibrations(Comparison.of([frame(true[:5], found[:5], bent[:5])])) == {}
 
 
 def test_errors_are_those_that_were_made():
     true = cars(20, np.random.default_rng(0))
     made = dict(away=0.12, aside=-0.07, bottom=0.1, length=-0.2, width=0.0, height=0.06, yaw=0.05)
-    errors = box_errors([frame(true, moved(true, **made))], "Car", 0.2)
+    errors = measure_box_errors([frame(true, moved(true, **made))], "Car", 0.2)
     for title, row in errors["by_range"].items():
         for name in ERRORS:
             assert row[name]["median"] == pytest.approx(made[name], abs=1e-5), (title, name)
@@ -93,12 +95,12 @@ def test_what_is_put_right_counts_and_what_is_not_found_does_not():
     off[4:8, :2] += 0.3  # from above as well
     found, scores = np.concatenate([off, off[:1] + [0, 200, 0, 0, 0, 0, 0]]), np.full(13, 0.9)
     scores[11] = 0.1     # too weak to count
-    content = box_errors([frame(true, found, scores)], "Car", 0.2)
+    content = measure_box_errors([frame(true, found, scores)], "Car", 0.2)
     assert content["by_range"]["all"]["pairs"] <= 11
     strict = content["strict"]
     assert strict["z"]["space"] > strict["as it is"]["space"]
     assert strict["x, y, z"]["space"] == strict["x, y"]["above"] == 100
     assert strict["z"]["above"] == strict["as it is"]["above"] < 100
-    assert box_errors([frame(true, off[:0])], "Car", 0.2)["strict"]["z"]["space"] is None
-    assert box_errors([], "Pedestrian", 0.2)["by_range"]["all"]["pairs"] == 0
+    assert measure_box_errors([frame(true, off[:0])], "Car", 0.2)["strict"]["z"]["space"] is None
+    assert measure_box_errors([], "Pedestrian", 0.2)["by_range"]["all"]["pairs"] == 0
     assert DETECTED["Car"].strict == 0.7

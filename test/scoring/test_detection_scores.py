@@ -14,13 +14,22 @@ from samples import CALIBRATION
 
 from lidar_perception.data.kitti.labels import parse_label, to_ground_truth
 from lidar_perception.data.kitti.write import project_boxes
-from lidar_perception.scoring.average_precision import at_recall, averages, recall_thresholds
+from lidar_perception.scoring.average_precision import (
+    average_curve,
+    choose_thresholds,
+    sample_curve,
+)
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.scores import CentreScores
-from lidar_perception.scoring.detections import Detected
-from lidar_perception.scoring.kitti.camera_objects import camera_objects
-from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED, Comparison, precision
-from lidar_perception.scoring.kitti.report import ROWS, DetectionReport, mean_3d
+from lidar_perception.scoring.detections import FrameDetections
+from lidar_perception.scoring.kitti.camera_objects import to_camera_objects
+from lidar_perception.scoring.kitti.protocol import (
+    DIFFICULTIES,
+    SCORED,
+    Comparison,
+    compute_precision,
+)
+from lidar_perception.scoring.kitti.report import ROWS, DetectionReport, average_3d
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError
 
 pytestmark = pytest.mark.no_cover  # others run these lines
@@ -38,7 +47,7 @@ def report(frames, calibration=CALIBRATION):
     """frames: (label text, result text)."""
     total = DetectionReport()
     for truth, found in frames:
-        total.update(Detected("frame", labels(truth), labels(found), calibration))
+        total.update(FrameDetections("frame", labels(truth), labels(found), calibration))
     return total
 
 
@@ -65,7 +74,7 @@ REGION = "DontCare -1 -1 -10 {} 100 {} 250 -1 -1 -1 -1000 -1000 -1000 -10"
 WRONG = dict(left=900, z=40.0, x=10.0)  # another place, in the image and in space
 
 
-def together(*lines):
+def concatenate(*lines):
     return "\n".join(lines)
 
 
@@ -80,7 +89,7 @@ def test_a_second_reading_of_the_protocol_gives_the_same(seed, count, noise):
         prepared = reference.prepare(frames, metric)
         for name in SCORED:
             for level in DIFFICULTIES:
-                found = precision(compared, name, metric, overlaps[name], level)
+                found = compute_precision(compared, name, metric, overlaps[name], level)
                 expected = reference.evaluate(prepared, name, level, overlaps[name], metric)
                 if expected is None:
                     assert found is None
@@ -94,10 +103,10 @@ def test_a_second_reading_of_the_protocol_gives_the_same(seed, count, noise):
 def test_average_precision_of_four_objects_worked_out_by_hand():
     # Scores: 0.9 right, 0.8 wrong, 0.7 right, 0.6 wrong, 0.5 right; the fourth car is missed.
     # Recall 1/4, 2/4, 3/4 at precision 1, 2/3, 3/5.
-    truth = together(*(car(left=120 * i, x=6.0 * i) for i in range(4)))
-    found = together(car(score=0.9, left=0), car(score=0.8, **WRONG),
-                     car(score=0.7, left=120, x=6.0, alpha=np.pi / 2),
-                     car(score=0.6, left=900, z=50.0, x=20.0), car(score=0.5, left=240, x=12.0))
+    truth = concatenate(*(car(left=120 * i, x=6.0 * i) for i in range(4)))
+    found = concatenate(car(score=0.9, left=0), car(score=0.8, **WRONG),
+                        car(score=0.7, left=120, x=6.0, alpha=np.pi / 2),
+                        car(score=0.6, left=900, z=50.0, x=20.0), car(score=0.5, left=240, x=12.0))
     row = ap([(truth, found)])["Car"]["3d"]["easy"]
     assert row["objects"] == 4
     # 40 points: 10 up to 1/4, 10 up to 2/4, 10 up to 3/4, 10 beyond.
@@ -115,7 +124,7 @@ def test_average_precision_of_four_objects_worked_out_by_hand():
 def test_average_precision_of_a_hundred_objects_worked_out_by_hand():
     # 50 cars found, then 50 false ones, then the other 50 cars: precision 1 up to recall 1/2, and
     # at recall 1 it is 100 / 150, which is the best there is beyond 1/2.
-    frames = [(car(), together(car(score=0.9 - i * 1e-3), car(score=0.5 + i * 1e-4, **WRONG)))
+    frames = [(car(), concatenate(car(score=0.9 - i * 1e-3), car(score=0.5 + i * 1e-4, **WRONG)))
               for i in range(50)]
     frames += [(car(), car(score=0.4 - i * 1e-3)) for i in range(50)]
     for key in ("", "official_"):
@@ -148,8 +157,8 @@ def test_average_precision_of_a_hundred_objects_worked_out_by_hand():
     ("found twice", None, car(score=0.95), "easy", 100, 100),
 ])
 def test_what_counts_as_wrong(case, other_truth, other_found, level, image, space):
-    truth = together(car(), *([other_truth] if other_truth else []))
-    rows = ap([(truth, together(car(score=0.9), other_found))])["Car"]
+    truth = concatenate(car(), *([other_truth] if other_truth else []))
+    rows = ap([(truth, concatenate(car(score=0.9), other_found))])["Car"]
     assert rows["3d"][level]["objects"] == 1
     found = [rows[metric][level]["r40"] for metric in ("image", "bev", "3d")]
     assert found == [image, space, space]
@@ -178,7 +187,7 @@ def test_truncation_of_tracks_is_computed_and_their_level_is_no_share():
               {"truncated": 0.21}, {}]
     boxes = [inside, inside, across, inside, across, across]
     truth = GroundTruth.of(boxes, [0] * 6, extras)
-    objects = camera_objects(truth, CALIBRATION)
+    objects = to_camera_objects(truth, CALIBRATION)
     assert objects.truncated == pytest.approx([0, 0, share, 1, 0.21, share])
 
 
@@ -186,7 +195,7 @@ def test_what_a_label_does_not_say_is_computed_from_its_box():
     text = "\n".join(car(left=100 * i, x=i - 3.0, z=15.0 + i, alpha=-10) for i in range(6))
     said, bare = labels(text), labels(text)
     bare = GroundTruth.of(bare.boxes, bare.class_ids)
-    said, bare = camera_objects(said, CALIBRATION), camera_objects(bare, CALIBRATION)
+    said, bare = to_camera_objects(said, CALIBRATION), to_camera_objects(bare, CALIBRATION)
     np.testing.assert_allclose(bare.boxes[:, :6], said.boxes[:, :6], atol=1e-6)
     np.testing.assert_allclose(np.cos(bare.boxes[:, 6] - said.boxes[:, 6]), 1, atol=1e-6)
     x, z = np.arange(6) - 3.0, 15.0 + np.arange(6)
@@ -201,7 +210,7 @@ def test_what_a_label_does_not_say_is_computed_from_its_box():
 def test_the_truth_scores_100_in_everything(seed):
     rng = np.random.default_rng(seed)
     # Objects far apart: where labels overlap one another one may be found by another's box.
-    truths = [labels(together(*(reference.line(reference.with_pixels(
+    truths = [labels(concatenate(*(reference.line(reference.with_pixels(
         {**reference.some_object(rng), "x": 8.0 * k - 8, "z": 20.0})) for k in range(3))))
         for _ in range(rng.integers(1, 40))]
     total = DetectionReport()
@@ -209,7 +218,7 @@ def test_the_truth_scores_100_in_everything(seed):
         scores = rng.uniform(0, 1, len(truth))
         found = GroundTruth.of(truth.boxes, truth.class_ids,
                                [{**e, "score": s} for e, s in zip(truth.extras, scores)])
-        total.update(Detected("frame", truth, found, CALIBRATION))
+        total.update(FrameDetections("frame", truth, found, CALIBRATION))
     content = total.compute()
     for name in SCORED:
         for row in ("image", "aos", "bev", "3d", "bev_relaxed", "3d_relaxed"):
@@ -228,16 +237,18 @@ def test_the_order_of_detections_changes_nothing(seed):
         truth, found = reference.random_frame(rng)
         lines = [f"{line.rsplit(' ', 1)[0]} {rng.integers(1, 4) / 4}"  # many equal scores
                  for line in found.splitlines()]
-        frames.append((truth, together(*lines)))
-        shuffled.append((truth, together(*rng.permutation(lines))))
+        frames.append((truth, concatenate(*lines)))
+        shuffled.append((truth, concatenate(*rng.permutation(lines))))
     assert report(frames).compute() == report(shuffled).compute()
 
 
 def test_the_order_of_equal_scores_changes_nothing():
     # The first of two people is found by either detection, the second by one of them only.
-    truth = together(*(car("Pedestrian", left=300 * i, x=1.6 * i) for i in range(2)))
+    truth = concatenate(*(car("Pedestrian", left=300 * i, x=1.6 * i) for i in range(2)))
     found = [car("Pedestrian", x=x, score=0.5) for x in (0.8, -0.8)]
-    there, back = (ap([(truth, together(*order))])["Pedestrian"] for order in (found, found[::-1]))
+    there, back = (
+        ap([(truth, concatenate(*order))])["Pedestrian"] for order in (found, found[::-1])
+    )
     assert there == back and there["bev_relaxed"]["easy"]["r40"] > 0
 
 
@@ -246,7 +257,7 @@ def test_the_order_of_equal_scores_changes_nothing():
 def test_a_wrong_detection_of_lower_score_never_raises_ap(seed):
     rng = np.random.default_rng(seed)
     frames = [reference.random_frame(rng) for _ in range(20)]
-    worse = [(truth, together(*found.splitlines(), *(
+    worse = [(truth, concatenate(*found.splitlines(), *(
         car(name, left=2000 + 200 * i, x=300.0, score=-rng.uniform())
         for i, name in enumerate(SCORED)))) for truth, found in frames]
     before, after = numbers(ap(frames)), numbers(ap(worse))
@@ -265,7 +276,7 @@ def test_without_objects_or_frames_there_is_no_figure():
     content = report([]).compute()
     assert content["frames"] == 0 and content["ap"] == {} and content["map_3d"] is None
     content = report([("", car(score=0.5))]).compute()
-    assert mean_3d(content["ap"]) is None and content["ap"]["Car"]["3d"]["easy"] is None
+    assert average_3d(content["ap"]) is None and content["ap"]["Car"]["3d"]["easy"] is None
     json.dumps(content, allow_nan=False)
 
 
@@ -284,10 +295,10 @@ def test_detections_are_projected_and_outside_the_image_they_do_not_count():
     found = Detections.of([ahead, behind, beside], CLASSES.index("Car"), [0.5, 0.9, 0.8])
     for boxes, expected in ((found, 100), (found[1:], 0)):
         total = DetectionReport()
-        total.update(Detected("frame", truth, boxes, CALIBRATION))
+        total.update(FrameDetections("frame", truth, boxes, CALIBRATION))
         assert total.compute()["ap"]["Car"]["bev"]["hard"]["r40"] == expected
     total = DetectionReport()
-    total.update(Detected("frame", truth, found))  # no camera: everything around counts
+    total.update(FrameDetections("frame", truth, found))  # no camera: everything around counts
     rows = total.compute()["ap"]["Car"]
     assert rows["bev"]["hard"]["r40"] == pytest.approx(100 / 3) and "image" not in rows
 
@@ -296,7 +307,7 @@ def test_detections_are_projected_and_outside_the_image_they_do_not_count():
 def test_a_number_that_is_not_finite_is_an_error_that_names_the_frame(broken):
     found = Detections.of(**{"boxes": labels(car()).boxes, "class_ids": 0, "scores": 1, **broken})
     with pytest.raises(InputError, match=r"^000123: .*box 1 of 1 .*not finite"):
-        DetectionReport().update(Detected("000123", labels(car()), found, CALIBRATION))
+        DetectionReport().update(FrameDetections("000123", labels(car()), found, CALIBRATION))
 
 
 @pytest.mark.parametrize("shift, taller, words", [
@@ -307,10 +318,10 @@ def test_a_number_that_is_not_finite_is_an_error_that_names_the_frame(broken):
 ])
 def test_boxes_that_are_right_from_above_but_not_in_space_are_noticed(shift, taller, words):
     total = DetectionReport()
-    truth = labels(together(*(car(left=100 * i, x=5.0 * i - 10) for i in range(5))))
+    truth = labels(concatenate(*(car(left=100 * i, x=5.0 * i - 10) for i in range(5))))
     found = Detections.of(truth.boxes + [0, 0, shift, 0, 0, taller, 0], 0, np.arange(5) / 5)
     for _ in range(10):
-        total.update(Detected("frame", truth, found, CALIBRATION))
+        total.update(FrameDetections("frame", truth, found, CALIBRATION))
     content = total.compute()
     assert content["matched"]["Car"]["pairs"] == 50
     assert content["matched"]["Car"]["z_error_m"] == pytest.approx(shift, abs=0.01)
@@ -356,8 +367,8 @@ def test_pedestrians_by_centre_distance_worked_out_by_hand():
                            [PEDESTRIAN] * 2)
     near, far, behind = (person + [dx, 0, 0, 0, 0, 0, 0] for dx in (0.9, 1.1, -30))
     found = Detections.of([near, far, behind], PEDESTRIAN, [0.8, 0.3, 0.9])
-    total.update(Detected("a", truth, found, CALIBRATION))
-    total.update(Detected("no pedestrian", GroundTruth.of([], []), found, CALIBRATION))
+    total.update(FrameDetections("a", truth, found, CALIBRATION))
+    total.update(FrameDetections("no pedestrian", GroundTruth.of([], []), found, CALIBRATION))
     content = total.compute()["pedestrian_centres"]
     assert (content["frames"], content["ground_truth"]) == (1, 2)
     # near hits; far does not; what is behind the camera does not count: 2 * 1 / (2 + 2)
@@ -371,7 +382,7 @@ def test_pedestrians_by_centre_distance_worked_out_by_hand():
 def test_thresholds_are_scores_of_hits_at_evenly_spaced_recall(seed, objects):
     rng = np.random.default_rng(seed)
     hits = rng.uniform(0, 1, rng.integers(1, objects + 1))
-    chosen = recall_thresholds(hits, objects)
+    chosen = choose_thresholds(hits, objects)
     assert len(chosen) <= 41 and (np.diff(chosen) < 0).all() and np.isin(chosen, hits).all()
     recall = np.array([(hits >= t).sum() for t in chosen]) / objects
     # each within half a step of its point; the last hit stands for what is left
@@ -382,9 +393,9 @@ def test_thresholds_are_scores_of_hits_at_evenly_spaced_recall(seed, objects):
 
 @pytest.mark.parametrize("objects", [1, 2, 7, 40, 41, 1000])
 def test_a_curve_without_an_error_averages_to_100_where_the_program_cannot(objects):
-    thresholds = recall_thresholds(np.linspace(1, 0, objects), objects)
+    thresholds = choose_thresholds(np.linspace(1, 0, objects), objects)
     right = np.ones(len(thresholds))
-    assert averages(at_recall(right, objects)) == pytest.approx((100, 100))
-    official = averages(at_recall(right, objects, official=True))
+    assert average_curve(sample_curve(right, objects)) == pytest.approx((100, 100))
+    official = average_curve(sample_curve(right, objects, official=True))
     assert official[1] == pytest.approx(100 * (min(objects, 41) - 1) / 40)
-    assert averages(at_recall(np.zeros(0), objects)) == (0, 0)
+    assert average_curve(sample_curve(np.zeros(0), objects)) == (0, 0)

@@ -17,7 +17,7 @@ from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED
 from lidar_perception.scoring.kitti.report import INTERVALS
-from lidar_perception.scoring.thinning import thinned
+from lidar_perception.scoring.thinning import thin_points
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, InputError
 
 PERSON, CAR, REGION = LABELS.splitlines()
@@ -157,11 +157,11 @@ def test_a_smaller_share_is_part_of_a_larger_one(kitti):
     frame = open_recording(kitti).frames[0].load()
     before = frame
     for share in (1.0, 0.5, 0.2, 0.1, 0.0):
-        now = thinned(frame, share, "000000")
+        now = thin_points(frame, share, "000000")
         assert set(map(bytes, now.xyz)) <= set(map(bytes, before.xyz))
         assert abs(len(now) - share * len(frame)) <= 3 * np.sqrt(len(frame))
         before = now
-    assert thinned(frame, 1.0, "a") is frame and len(before) == 0
+    assert thin_points(frame, 1.0, "a") is frame and len(before) == 0
 
 
 def test_written_results_score_as_what_was_found(kitti, detector, tmp_path):

@@ -27,7 +27,7 @@ from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.params import MIN_SCORE
-from lidar_perception.scoring.nuscenes.report import OURS
+from lidar_perception.scoring.nuscenes.report import DETECTED_NAMES
 from lidar_perception.types import CLASSES, Detections, InputError
 
 TABLES = folder.make_tables(seed=2, frames=4, objects=60)
@@ -90,7 +90,7 @@ def test_a_checkpoint_is_run_and_its_results_score_the_same(root, detector, tmp_
     car, person = (direct["classes"][n] for n in ("car", "pedestrian"))
     assert car["mean_ap"] > 99 and car["ate"] < 0.3 and person["mean_ap"] > 99
     assert all(direct["classes"][n]["mean_ap"] == 0 and direct["classes"][n]["ate"] == 1
-               for n in NAMES if n not in OURS)
+               for n in NAMES if n not in DETECTED_NAMES)
     assert direct["ours"]["ave"] == direct["ours"]["aae"] == 1
     assert direct["all"]["map"] == pytest.approx(0.3 * direct["ours"]["map"])
     read, _ = evaluate(tmp_path, "--data", root, "--results", out)

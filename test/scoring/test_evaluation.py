@@ -18,18 +18,23 @@ from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams, SeedParams
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.reproduction.labelled import load_labelled
-from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, match_centres, range_bins
+from lidar_perception.scoring.centres.matching import (
+    RANGE_NAMES,
+    Score,
+    find_range_bins,
+    match_centres,
+)
 from lidar_perception.scoring.centres.report import (
     CandidateReport,
     CandidateResult,
-    by_pipeline,
-    of_frame,
-    pedestrians,
-    pedestrians_of,
+    load_pedestrians,
+    measure_candidates,
+    measure_frame,
+    select_pedestrians,
 )
-from lidar_perception.scoring.detections import Detected
+from lidar_perception.scoring.detections import FrameDetections
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.scoring.run import Skipped, fill, results
+from lidar_perception.scoring.run import Skipped, fill, measure_frames
 from lidar_perception.types import (
     CLASSES,
     PEDESTRIAN,
@@ -130,7 +135,7 @@ def test_hits_and_misses_add_up_to_the_truth_and_to_what_was_found(seed, frames)
         truths.append(truth)
         found_count += len(found)
     table = score.table()
-    by_range = np.bincount(range_bins(np.concatenate(truths)), minlength=len(RANGE_NAMES))
+    by_range = np.bincount(find_range_bins(np.concatenate(truths)), minlength=len(RANGE_NAMES))
     for name, count in zip(RANGE_NAMES, by_range):
         assert table[name]["tp"] + table[name]["fn"] == count
     everything = table["all"]
@@ -171,7 +176,7 @@ def test_a_hit_belongs_to_the_range_of_the_true_object():
 def test_a_range_begins_at_its_lower_limit():
     at = boxes([0, 0, 9], [14.999, 0, 0], [0, 15, 0], [18, -24, 0], [45, 0, 0], [60, 0, 0],
                [1e4, 0, 0])
-    assert [RANGE_NAMES[i] for i in range_bins(at)] == [
+    assert [RANGE_NAMES[i] for i in find_range_bins(at)] == [
         "0-15", "0-15", "15-30", "30-45", "45-60", "60+", "60+"]
 
 
@@ -207,9 +212,9 @@ def truth_of(*centres, label="Pedestrian"):
 
 def run(frames, source="ground_truth"):
     report, recording = CandidateReport(), Recording(Path("here"), "memory", frames)
-    start = partial(by_pipeline, PipelineParams(seed=SeedParams(source=source)))
+    start = partial(measure_candidates, PipelineParams(seed=SeedParams(source=source)))
     fill(report, recording, start)
-    found = [result for _, result in results(recording, start)]
+    found = [result for _, result in measure_frames(recording, start)]
     assert len(found) == len(frames)
     return report.compute(), found
 
@@ -252,8 +257,8 @@ def test_an_empty_recording_has_an_empty_report():
 def test_only_pedestrians_count():
     mixed = GroundTruth.of(boxes([1, 0, 0], [2, 0, 0], [3, 0, 0]),
                            [PEDESTRIAN, CLASSES.index("Person_sitting"), CLASSES.index("Cyclist")])
-    np.testing.assert_array_equal(pedestrians(mixed), boxes([1, 0, 0]))
-    assert pedestrians(None).shape == (0, 7)
+    np.testing.assert_array_equal(select_pedestrians(mixed), boxes([1, 0, 0]))
+    assert select_pedestrians(None).shape == (0, 7)
 
 
 def test_labels_behind_the_camera_are_not_missed_in_its_view():
@@ -263,16 +268,16 @@ def test_labels_behind_the_camera_are_not_missed_in_its_view():
         Frame.of("a", scan, GroundTruth.of(own, [PEDESTRIAN] * len(own)), CALIBRATION)
         for own in (people, people * [-1, -1, 1, 1, 1, 1, 1],
                     np.concatenate([people, people * [-1, -1, 1, 1, 1, 1, 1]])))
-    expected, found = of_frame(ahead, PAPER), of_frame(around, PAPER)
+    expected, found = measure_frame(ahead, PAPER), measure_frame(around, PAPER)
     np.testing.assert_array_equal(found.truth, people)
     np.testing.assert_array_equal(found.boxes["final"], expected.boxes["final"])
-    assert of_frame(behind, PAPER) is None
-    assert len(pedestrians_of(around, view=False)) == 2 * len(people)
+    assert measure_frame(behind, PAPER) is None
+    assert len(load_pedestrians(around, view=False)) == 2 * len(people)
 
     labels = around.truth()
     detections = Detections(labels.boxes.astype(np.float32), labels.class_ids, np.ones(len(labels)))
     report = DetectionReport()
-    report.update(Detected("a", labels, detections, CALIBRATION))
+    report.update(FrameDetections("a", labels, detections, CALIBRATION))
     counts = report.compute()["pedestrian_centres"]["of_all"]["all"]
     assert (counts["tp"], counts["fp"], counts["fn"]) == (len(people), 0, 0)
 

@@ -7,41 +7,46 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.scoring.centres.scores import CentreScores
-from lidar_perception.scoring.intervals import DRIVES, RUN, blocks, interval
+from lidar_perception.scoring.intervals import (
+    BLOCK_FRAMES,
+    MIN_DRIVES,
+    compute_interval,
+    group_frames,
+)
 
 
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=15), st.booleans())
 def test_every_frame_is_in_one_block_and_a_block_is_of_one_drive(lengths, named):
     names = [f"{drive:04}/{i:06}" if named else f"{drive}{i:06}"
              for drive, count in enumerate(lengths) for i in range(count)]
-    parts = blocks(names)
+    parts = group_frames(names)
     assert sorted(np.concatenate([np.zeros(0, int), *parts]).tolist()) == [*range(len(names))]
     for part in parts:
         drives = {names[i].rpartition("/")[0] for i in part}
         assert len(drives) == 1 and (named or len(part) == 1)
     drives = sum(count > 0 for count in lengths)
-    if named and drives >= DRIVES:
+    if named and drives >= MIN_DRIVES:
         assert len(parts) == drives
     else:
-        assert all(len(part) <= RUN for part in parts)
+        assert all(len(part) <= BLOCK_FRAMES for part in parts)
 
 
 @given(st.integers(1, 45))
 def test_a_bag_whose_frames_are_named_by_time_is_one_drive(count):
     times, named = [f"{10**9 * i}" for i in range(count)], [f"0000/{i}" for i in range(count)]
-    assert [*map(list, blocks(times, follow=True))] == [*map(list, blocks(named))]
+    assert [*map(list, group_frames(times, follow=True))] == [*map(list, group_frames(named))]
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 40))
 def test_an_interval_holds_the_score_and_repeats_itself(seed, count):
     values = np.random.default_rng(seed).normal(0, 1, count)
     parts = [np.array([i]) for i in range(count)]
-    low, high = interval(lambda frames: values[frames].mean(), parts, 300)
+    low, high = compute_interval(lambda frames: values[frames].mean(), parts, 300)
     assert low - 0.01 <= values.mean() <= high + 0.01
-    assert [low, high] == interval(lambda frames: values[frames].mean(), parts, 300)
-    assert interval(lambda frames: 3.0, parts, 10) == [3.0, 3.0]
-    assert interval(lambda frames: 3.0, parts[:1], 10) is None
-    assert interval(lambda frames: None, parts, 10) is None
+    assert [low, high] == compute_interval(lambda frames: values[frames].mean(), parts, 300)
+    assert compute_interval(lambda frames: 3.0, parts, 10) == [3.0, 3.0]
+    assert compute_interval(lambda frames: 3.0, parts[:1], 10) is None
+    assert compute_interval(lambda frames: None, parts, 10) is None
 
 
 def test_frames_of_one_drive_that_are_alike_do_not_narrow_it():
@@ -53,6 +58,6 @@ def test_frames_of_one_drive_that_are_alike_do_not_narrow_it():
         once.update(person, found, np.ones(1), f"{drive}/0")
         for i in range(10):
             often.update(person, found, np.ones(1), f"{drive}/{i}")
-    assert once.f1_interval(0.5, 200) == often.f1_interval(0.5, 200)
-    low, high = once.f1_interval(0.5, 200)
+    assert once.compute_f1_interval(0.5, 200) == often.compute_f1_interval(0.5, 200)
+    low, high = once.compute_f1_interval(0.5, 200)
     assert low < 50 < high

@@ -17,12 +17,12 @@ from lidar_perception.data.nuscenes.folder import open_nuscenes
 from lidar_perception.data.nuscenes.results import META, read_results
 from lidar_perception.scoring.nuscenes.protocol import (
     RANGES,
-    class_scores,
-    counted,
-    hit_errors,
-    summary,
+    compute_errors,
+    score_class,
+    select_counted,
+    summarize,
 )
-from lidar_perception.scoring.nuscenes.report import OURS, NuscenesReport, key_frame
+from lidar_perception.scoring.nuscenes.report import DETECTED_NAMES, NuscenesReport, select_boxes
 from lidar_perception.types import InputError
 
 TABLES = folder.make_tables(seed=2, frames=4, objects=60)
@@ -40,8 +40,8 @@ def boxes(*centres, kind="car", scores=0.0, yaw=0.0, **columns):
 def scored(truth, found, kind="car", true_frames=None, found_frames=None):
     def numbers(given, of):
         return np.zeros(len(of), int) if given is None else np.array(given)
-    return class_scores(kind, truth, numbers(true_frames, truth), found,
-                        numbers(found_frames, found))
+    return score_class(kind, truth, numbers(true_frames, truth), found,
+                       numbers(found_frames, found))
 
 
 ROW = [(10.0 * i, 0.0) for i in range(20)]
@@ -52,13 +52,13 @@ def test_everything_found_scores_one():
                boxes(*ROW, scores=np.linspace(1, 0.1, 20), velocities=1.0, attributes=6))
     assert s.objects == s.detections == 20 and s.mean_ap == pytest.approx(1)
     assert s.errors == dict.fromkeys(ERRORS, 0.0)
-    assert summary({"car": s})["nds"] == pytest.approx(1)
+    assert summarize({"car": s})["nds"] == pytest.approx(1)
 
 
 def test_the_best_without_velocities_and_attributes_is_0_8():
     s = scored(boxes(*ROW, velocities=1.0, attributes=6), boxes(*ROW, scores=0.5))
     assert (s.errors["ave"], s.errors["aae"]) == (1, 1)
-    assert summary({"car": s})["nds"] == pytest.approx(0.8)
+    assert summarize({"car": s})["nds"] == pytest.approx(0.8)
 
 
 def test_one_of_four_is_recall_0_25():
@@ -119,14 +119,14 @@ def test_errors_of_a_pair():
     truth = boxes((0, 0), velocities=[3.0, 0.0], attributes=5)
     found = boxes((0.3, 0.4), yaw=math.pi - 0.1, velocities=[0.0, 4.0], attributes=6)
     larger = GlobalBoxes.of(found.centres, 2 * found.sizes, found.rotations, found.class_ids)
-    e = hit_errors(truth, found, False)
+    e = compute_errors(truth, found, False)
     assert {k: v[0] for k, v in e.items()} == pytest.approx(
         dict(ate=0.5, ase=0, aoe=math.pi - 0.1, ave=5, aae=1))
-    assert hit_errors(truth, found, True)["aoe"] == pytest.approx(0.1)
-    assert hit_errors(truth, larger, False)["ase"] == pytest.approx(7 / 8)
+    assert compute_errors(truth, found, True)["aoe"] == pytest.approx(0.1)
+    assert compute_errors(truth, larger, False)["ase"] == pytest.approx(7 / 8)
     for true, other in ((boxes((0, 0)), found), (truth, boxes((0, 0)))):
-        assert np.isnan(hit_errors(true, other, False)["ave"])
-    assert np.isnan(hit_errors(boxes((0, 0)), found, False)["aae"])
+        assert np.isnan(compute_errors(true, other, False)["ave"])
+    assert np.isnan(compute_errors(boxes((0, 0)), found, False)["aae"])
 
 
 def test_the_error_is_a_mean_of_means_over_recall():
@@ -140,8 +140,11 @@ def test_the_error_is_a_mean_of_means_over_recall():
 def test_a_class_counts_within_its_range_of_the_vehicle(kind):
     there = np.array([100.0, 50.0])
     away = RANGES[kind]
-    kept = counted(boxes(*(there + [away * s, 0] for s in (0.999, 1, -0.999, 1.2)), kind=kind),
-                   np.array([100, 50, 7]), boxes())
+    kept = select_counted(
+        boxes(*(there + [away * s, 0] for s in (0.999, 1, -0.999, 1.2)), kind=kind),
+        np.array([100, 50, 7]),
+        boxes(),
+    )
     assert kept.tolist() == [True, False, True, False]
     assert (RANGES["car"], RANGES["pedestrian"], RANGES["barrier"]) == (50, 40, 30)
 
@@ -149,12 +152,12 @@ def test_a_class_counts_within_its_range_of_the_vehicle(kind):
 def test_labels_without_points_and_cycles_in_racks_do_not_count():
     rack = boxes((0, 0), yaw=math.pi / 2)  # 2 m along x, 4 m along y
     for kind, inside in ("bicycle", False), ("motorcycle", False), ("pedestrian", True):
-        kept = counted(boxes((0.9, 1.9), (1.9, 0.9), kind=kind), np.zeros(3), rack)
+        kept = select_counted(boxes((0.9, 1.9), (1.9, 0.9), kind=kind), np.zeros(3), rack)
         assert kept.tolist() == [inside, True]
-    assert counted(boxes((0, 0), (1, 0), (2, 0), points=[0, 3, -1]), np.zeros(3),
-                   boxes()).tolist() == [False, True, True]
+    assert select_counted(boxes((0, 0), (1, 0), (2, 0), points=[0, 3, -1]), np.zeros(3),
+                          boxes()).tolist() == [False, True, True]
     none = GlobalBoxes.of(np.zeros((1, 3)), np.ones((1, 3)), [[1, 0, 0, 0]], -1)
-    assert not counted(none, np.zeros(3), boxes()).any()
+    assert not select_counted(none, np.zeros(3), boxes()).any()
 
 
 def reported(root, results):
@@ -163,7 +166,7 @@ def reported(root, results):
     frames, report = open_nuscenes(root), NuscenesReport()
     boxes = read_results(path, frames)
     for frame in frames:
-        report.update(key_frame(frame, boxes[frame.name]))
+        report.update(select_boxes(frame, boxes[frame.name]))
     return report.compute()
 
 
@@ -192,7 +195,9 @@ def test_the_same_as_a_second_reading(tmp_path, seed, frames, objects, noise):
     by_class, over = reference.evaluate(tables, results, CATEGORIES)
     content = reported(folder.save(tmp_path, tables, sweeps=False), results)
     assert content["frames"] == 2 * frames and 0 < content["all"]["map"] < 100
-    close_to_reference(content, by_class, {"all": over, "ours": reference.over(by_class, OURS)})
+    close_to_reference(
+        content, by_class, {"all": over, "ours": reference.over(by_class, DETECTED_NAMES)}
+    )
 
 
 @pytest.mark.parametrize("seed, ties", [(4, False), (5, False), (4, True)])

@@ -9,8 +9,8 @@ import pytest
 from tracking_samples import START, TENTH, crowd
 
 from lidar_perception.data.bag import BagWriter
-from lidar_perception.scoring.recorded import answered
-from lidar_perception.scoring.tracking.from_bag import recorded_tracks
+from lidar_perception.scoring.recorded import read_results
+from lidar_perception.scoring.tracking.from_bag import score_recorded_tracks
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import GroundTruth
@@ -47,20 +47,20 @@ def recorded(request, tmp_path):
 
 def test_recorded_tracks_are_counted_and_scored_where_labels_have_ids(recorded):
     path, with_ids, _ = recorded
-    result = recorded_tracks(answered(path, TRACKS)[0], None)
+    result = score_recorded_tracks(read_results(path, TRACKS)[0], None)
     assert result.count == {"Car": 2, "Cyclist": 1, "Pedestrian": 3}
     if with_ids:
         scores = result.scores["Pedestrian"]
         assert (scores["true_tracks"], scores["switches"], result.problem) == (3, 0, None)
         assert scores["HOTA"] > 0.8
-        frames = answered(path, TRACKS)[0]
+        frames = read_results(path, TRACKS)[0]
         later = [replace(f, stamp_ns=f.stamp_ns + 600 * TENTH,
                          found=replace(f.found, ids=np.asarray(f.found.ids) + 100)) for f in frames]
-        both = recorded_tracks([*frames, *later], None).scores["Pedestrian"]  # two drives
+        both = score_recorded_tracks([*frames, *later], None).scores["Pedestrian"]  # two drives
         assert (both["true_tracks"], both["switches"], both["HOTA"]) == (6, 0, scores["HOTA"])
     else:
         assert result.scores == {} and "track id" in result.problem
-    assert answered(path, "/nothing")[0] == []
+    assert read_results(path, "/nothing")[0] == []
 
 
 def test_the_recorded_tracks_have_their_trails(recorded):

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from samples import object_folder, walker_label, write
 
 from lidar_perception.data.open import open_recording
-from lidar_perception.scoring.detections import by_files
-from lidar_perception.scoring.run import Skipped, fill, in_order, results
+from lidar_perception.scoring.detections import measure_result_files
+from lidar_perception.scoring.run import Skipped, fill, measure_frames, sort_results
 from lidar_perception.types import InputError, RunError
 
 COUNT = 5
@@ -58,19 +58,21 @@ def root(tmp_path):
 
 def test_in_many_processes_the_results_are_those_of_one_in_their_order(root):
     recording = open_recording(root)
-    one, two = ([*results(recording, counting, jobs=jobs)] for jobs in (1, 2))
+    one, two = ([*measure_frames(recording, counting, jobs=jobs)] for jobs in (1, 2))
     kinds = [type(result) for _, result in one]
     assert one == two and kinds == [type(result) for _, result in two]
     assert kinds == [tuple, Skipped, tuple, type(None), tuple]
     assert [i for i, _ in one] == [*range(COUNT)]
     chosen = [1, 2, 4]
-    assert [*results(recording, counting, chosen)] == [one[i] for i in chosen]
-    assert [*results(recording, counting, [], jobs=3)] == []
+    assert [*measure_frames(recording, counting, chosen)] == [one[i] for i in chosen]
+    assert [*measure_frames(recording, counting, [], jobs=3)] == []
 
 
 def test_processes_measure_the_frames_of_a_split(root, tmp_path):
     split = write(tmp_path / "split.txt", "000004 000000 000002")
-    found = [[*results(open_recording(root, split=split), counting, jobs=jobs)] for jobs in (1, 2)]
+    found = [
+        [*measure_frames(open_recording(root, split=split), counting, jobs=jobs)] for jobs in (1, 2)
+    ]
     assert found[0] == found[1]
     assert [name for _, (name, _) in found[0]] == ["000004", "000000", "000002"]
 
@@ -100,14 +102,14 @@ def test_a_command_whose_run_ends_says_so_in_one_line(root, tmp_path, monkeypatc
                        tmp_path / "found", "--jobs", jobs) == 2
         assert "result file" in error_line(capsys)
     with pytest.raises(RunError):
-        [*results(open_recording(root), partial(by_files, tmp_path / "found"))]
+        [*measure_frames(open_recording(root), partial(measure_result_files, tmp_path / "found"))]
 
 
 def test_a_mistake_is_no_skipped_frame_and_names_it(root):
     def mistaken(recording):
         return lambda frame: 1 // (frame.name != "000002")
     with pytest.raises(ZeroDivisionError) as error:
-        [*results(open_recording(root), mistaken)]
+        [*measure_frames(open_recording(root), mistaken)]
     assert error.value.__notes__ == ["while frame 000002 was measured"]
 
 
@@ -132,7 +134,7 @@ def test_start_is_called_once_and_each_frame_measured_once_when_it_is_asked_for(
     def start(recording):
         called.append("start")
         return lambda frame: called.append(frame.name)
-    found = results(open_recording(root), start)
+    found = measure_frames(open_recording(root), start)
     assert called == []
     next(found)
     assert called == ["start", "000000"]
@@ -141,7 +143,7 @@ def test_start_is_called_once_and_each_frame_measured_once_when_it_is_asked_for(
 
 def test_a_recording_that_cannot_be_opened_again_is_measured_here(root):
     recording = replace(open_recording(root), reopen=None)
-    assert len([*results(recording, counting)]) == COUNT
+    assert len([*measure_frames(recording, counting)]) == COUNT
 
 
 @given(st.sets(st.integers(0, 20)), st.randoms(use_true_random=False))
@@ -153,7 +155,7 @@ def test_pairs_come_in_order_each_as_soon_as_it_can(numbers, random):
         for number in sent:
             taken.append(number)
             yield number, -number
-    for k, pair in enumerate(in_order(pairs(), numbers)):
+    for k, pair in enumerate(sort_results(pairs(), numbers)):
         assert pair == (numbers[k], -numbers[k])
         needed = 1 + max(sent.index(number) for number in numbers[:k + 1])
         assert taken == sent[:needed]  # no more than it needed

@@ -22,19 +22,19 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.semantickitti import GROUND, MOVING, THINGS
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.ground.params import GROUND_METHODS
-from lidar_perception.scoring.points.report import SegmentationParams, by_methods
+from lidar_perception.scoring.points.report import SegmentationParams, measure_methods
 from lidar_perception.scoring.points.segmentation import (
     PROTOCOLS,
     RANGE_NAMES,
     ClusterReport,
     GroundReport,
     Objects,
-    ground_by_protocol,
-    ground_counts,
-    objects_in_boxes,
-    objects_of_instances,
+    count_by_protocol,
+    count_ground,
+    find_instances,
+    find_objects_in_boxes,
     score_clusters,
-    true_ground,
+    select_true_ground,
 )
 from lidar_perception.scoring.points.tables import PUBLISHED
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, GroundTruth, InputError, PointCloud
@@ -192,7 +192,7 @@ def test_points_low_in_a_box_are_neutral_and_small_objects_are_left_out():
                           column(20, 0, (-1.4, 0), 9), column(10, 1.1, (-1, 0), 3),
                           column(30, 0, (-1, 0), 4)]).astype(np.float32)
     truth = GroundTruth.of([[20, 0, -0.7, 2, 2, 2, 0], [10, 0, -0.7, 2, 2, 2, 0.0]], [CAR, VAN])
-    found = objects_in_boxes(xyz, truth)
+    found = find_objects_in_boxes(xyz, truth)
     assert found.owner.tolist() == [0] * 5 + [1] * 12 + [0] * 16
     assert found.region.tolist() == [1] * 17 + [0] * 16
     assert found.near.tolist() == [True] * 17 + [False] * 9 + [True] * 3 + [False] * 4
@@ -204,7 +204,7 @@ def test_a_point_in_two_boxes_belongs_to_the_smaller():
     boxes = [[10, 0, 0, 1, 1, 4, 0], [11, 0, 0, 5, 3, 4, 0]]
     for order in ([0, 1], [1, 0]):
         truth = GroundTruth.of(np.array(boxes)[order], np.array([CAR, TRUCK])[order])
-        found = objects_in_boxes(xyz.astype(np.float32), truth)
+        found = find_objects_in_boxes(xyz.astype(np.float32), truth)
         classes = np.array(["", *found.classes])[found.owner]
         assert classes.tolist() == ["Car"] * 20 + ["Truck"] * 30
 
@@ -213,7 +213,7 @@ def test_dont_care_and_no_boxes_are_no_objects():
     xyz = column(10, 0, (-1, 0), 20).astype(np.float32)
     for truth in (GroundTruth.of([[10, 0, 0, 2, 2, 4, 0]], [CLASSES.index("DontCare")]),
                   GroundTruth.of([], [])):
-        found = objects_in_boxes(xyz, truth)
+        found = find_objects_in_boxes(xyz, truth)
         assert found.classes == () and not found.owner.any() and not found.near.any()
 
 
@@ -225,7 +225,7 @@ def test_instances_are_the_things_of_one_class_and_number_moving_or_not():
                           for i in (0, 1))
     xyz = np.zeros((len(semantic), 3), np.float32)
     xyz[:12] = [30, 40, 1]
-    found = objects_of_instances(xyz, semantic, instance)
+    found = find_instances(xyz, semantic, instance)
     assert found.classes == ("car", "car", "person")
     assert found.owner.tolist() == np.repeat([1, 2, 3, 0, 0, 0, 0, 0, 0], counts).tolist()
     # Not counted: a car without an instance, a bicycle of 9 points, unlabelled, outliers.
@@ -241,7 +241,7 @@ def test_each_protocol_by_hand():
     expected = ([1] * 6 + [None] * 5 + [0, 0], [1] * 7 + [0, 0, None, None, 0, 0],
                 [1] * 6 + [0, 0, 0, None, None, 0, 0])
     for name, row in zip(PROTOCOLS, expected, strict=True):
-        ground, counted = true_ground(semantic, z, name)
+        ground, counted = select_true_ground(semantic, z, name)
         assert [int(g) if c else None for g, c in zip(ground, counted)] == row, name
     assert set(PUBLISHED) <= set(PROTOCOLS)
 
@@ -252,7 +252,7 @@ def test_low_vegetation_is_low_over_the_road_of_any_sensor(height):
     xyz[:, 2] = np.repeat([0.0, 0.4, 0.5], [400, 30, 20]) - height
     truth = PointTruth(np.repeat([40, 70], [400, 50]).astype(np.uint16), np.zeros(450, np.uint16))
     frame = replace(Frame.of("a", PointCloud(xyz), sensor_height=height), point_truth=lambda: truth)
-    result = by_methods(SegmentationParams(), ("cloth",), (), None)(frame)
+    result = measure_methods(SegmentationParams(), ("cloth",), (), None)(frame)
     tp, fp, fn, tn = result.ground["cloth"][0]["with vegetation"]
     assert (tp + fn, fp + tn) == (430, 20)
 
@@ -261,10 +261,10 @@ def test_counts_and_ratios_of_ground_by_hand():
     found = np.array([1, 1, 1, 0, 0, 0, 0, 1, 0], bool)
     ground = np.array([1, 1, 0, 1, 0, 0, 0, 1, 0], bool)
     counted = np.array([1, 1, 1, 1, 1, 1, 1, 0, 0], bool)
-    assert ground_counts(found, ground, counted).tolist() == [2, 1, 1, 3]
+    assert count_ground(found, ground, counted).tolist() == [2, 1, 1, 3]
     report = GroundReport()
     for _ in range(2):
-        report.update(ground_by_protocol(found[:7], np.where(ground[:7], 40, 50), np.zeros(7)), 3.0)
+        report.update(count_by_protocol(found[:7], np.where(ground[:7], 40, 50), np.zeros(7)), 3.0)
     row = report.compute()["protocols"]["without vegetation"]
     assert [row[k] for k in ("tp", "fp", "fn", "tn")] == [4, 2, 2, 6]
     assert [row[k] for k in ("precision", "recall", "f1", "accuracy")] == pytest.approx(
@@ -328,7 +328,7 @@ def test_the_real_scan_has_a_label_for_every_point():
     assert len(frame) == len(semantic) == len(instance) > 100_000
     assert np.isin(semantic, GROUND).mean() > 0.4
     cars = np.bincount(instance[semantic == 10])
-    assert objects_of_instances(frame.xyz, semantic, instance).classes.count("car") == np.sum(
+    assert find_instances(frame.xyz, semantic, instance).classes.count("car") == np.sum(
         cars[1:] >= 10)
 
 

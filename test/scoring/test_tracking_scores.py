@@ -13,11 +13,16 @@ from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.kitti.results import read_tracking_results, write_tracking_results
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.scoring.run import fill
-from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
-from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
-from lidar_perception.scoring.tracking.over_recall import over_recall
-from lidar_perception.scoring.tracking.pairs import Pairs, pairs_of, tracked_labels, without_ignored
-from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, observe
+from lidar_perception.scoring.tracking.clear import ClearCounts, count_clear
+from lidar_perception.scoring.tracking.hota import HotaCounts, count_hota
+from lidar_perception.scoring.tracking.over_recall import score_over_recall
+from lidar_perception.scoring.tracking.pairs import (
+    Pairs,
+    drop_ignored,
+    make_pairs,
+    to_tracked_labels,
+)
+from lidar_perception.scoring.tracking.report import TrackingReport, measure_tracking, observe
 from lidar_perception.scoring.tracking.tables import print_tracking_report
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError, PointCloud
@@ -55,8 +60,8 @@ def plainly(sequences):
 def counted(sequences):
     hota, clear = HotaCounts(), ClearCounts()
     for frames in sequences:
-        kept = [without_ignored(f) for f in frames]
-        hota, clear = hota + hota_counts(kept), clear + clear_counts(kept)
+        kept = [drop_ignored(f) for f in frames]
+        hota, clear = hota + count_hota(kept), clear + count_clear(kept)
     return hota.scores(), clear
 
 
@@ -68,7 +73,7 @@ def test_fast_scores_equal_a_slow_reading(seed):
         slow.hota(plainly(sequences)), abs=1e-12)
     assert (clear.tp, clear.fn, clear.fp, clear.switches, clear.fragments) == slow.clear(
         plainly(sequences))
-    curve = over_recall(sequences)
+    curve = score_over_recall(sequences)
     assert [curve[k] for k in ("sAMOTA", "AMOTA", "AMOTP")] == pytest.approx(
         slow.over_recall(plainly(sequences)), abs=1e-12)
 
@@ -89,7 +94,7 @@ def drive(ids=(1, 2), frames=10, switch_at=None, kind=CAR):
         truth = GroundTruth.of(boxes, [kind] * 2, [{"track_id": k, "occluded": 0,
                                                     "truncated": 0.0} for k in (7, 8)])
         names = ids[::-1] if switch_at is not None and i >= switch_at else ids
-        result.append((truth, tracked_labels(np.array(names), Detections.of(boxes, CAR, 0.9))))
+        result.append((truth, to_tracked_labels(np.array(names), Detections.of(boxes, CAR, 0.9))))
     return result
 
 
@@ -131,7 +136,11 @@ def test_drives_that_share_a_bag_are_scored_as_if_they_had_names():
                 frames.append(Frame.of(f"{k}/{i}", scan, truth, sequence=str(k) * named,
                                        index=i if named else len(frames)))
         recording, report = Recording("a", "", frames), TrackingReport()
-        fill(report, recording, by_tracker(lambda: lambda scan: found[scan.stamp_ns], ego="none"))
+        fill(
+            report,
+            recording,
+            measure_tracking(lambda: lambda scan: found[scan.stamp_ns], ego="none"),
+        )
         return report.compute()
 
     assert content(False) == content(True)
@@ -145,7 +154,7 @@ def test_frames_whose_pose_is_not_known_are_counted_and_said(capsys):
               for i, (truth, _) in enumerate(drive(frames=3))]
     for ego, unknown in ("recording", 2), ("none", 0):
         report = TrackingReport()
-        fill(report, Recording("a", "", frames), by_tracker(
+        fill(report, Recording("a", "", frames), measure_tracking(
             lambda: lambda scan: DetectionResult(Detections.none()), ego=ego))
         print_tracking_report({"ego": ego, **report.compute()}, Console(width=200))
         assert report.compute()["without_pose"] == unknown
@@ -160,7 +169,7 @@ def test_neighbour_classes_and_what_is_cut_off_neither_help_nor_harm():
            for t, k in drive()]
     assert scored(cut) is None
     behind = [(GroundTruth.of(t.boxes - [60.0, 0, 0, 0, 0, 0, 0], t.class_ids, t.extras),
-               tracked_labels(np.arange(1), Detections.of(t.boxes[:1] - 30.0, CAR, 0.9)))
+               to_tracked_labels(np.arange(1), Detections.of(t.boxes[:1] - 30.0, CAR, 0.9)))
               for t, _ in drive()]
     assert scored(behind, calibration=FORWARD_CAMERA) is None
     assert scored(behind)["misses"] == 2 * scored(behind)["false"] == 20
@@ -188,18 +197,18 @@ def test_without_tracks_all_is_missed_and_without_labels_all_is_false():
 
 def test_what_cannot_be_scored_says_why():
     truth, tracks = drive(frames=1)[0]
-    twice = tracked_labels(np.array([3, 3]), Detections.of(tracks.boxes, CAR))
+    twice = to_tracked_labels(np.array([3, 3]), Detections.of(tracks.boxes, CAR))
     with pytest.raises(InputError, match="a/0: a frame has the track id 3 twice"):
         observe("a", 0, truth, twice)
     with pytest.raises(InputError, match="no track id"):
-        pairs_of(GroundTruth.of(truth.boxes, truth.class_ids), tracks, None)
+        make_pairs(GroundTruth.of(truth.boxes, truth.class_ids), tracks, None)
     frame = Frame("a/0", 0, lambda: 1 / 0, lambda: GroundTruth.of(
         truth.boxes, truth.class_ids, [{"track_id": -1}] * len(truth)))  # as KITTI writes none
-    measure = by_tracker(lambda: None, ego="none")(Recording("a", "", [frame], frozenset()))
+    measure = measure_tracking(lambda: None, ego="none")(Recording("a", "", [frame], frozenset()))
     with pytest.raises(InputError, match="no track id"):  # before the scan is loaded
         measure(frame)
     with pytest.raises(InputError, match="needs a calibration"):
-        pairs_of(truth, tracks, None, "image")
+        make_pairs(truth, tracks, None, "image")
 
 
 def test_result_files_come_back_as_they_were(tmp_path):

@@ -29,13 +29,13 @@ def test_no_id_switches_on_real_drive(data, detector, ego):
     from lidar_perception.data.frame import POSES
     from lidar_perception.data.open import open_recording
     from lidar_perception.scoring.run import fill
-    from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker
+    from lidar_perception.scoring.tracking.report import TrackingReport, measure_tracking
     from lidar_perception.tracking.drive_tracker import choose_ego_source
     from lidar_perception.tracking.ego import has_odometry
 
     report, drive = TrackingReport(), open_recording(data / "kitti_tracking")
     if ego == "auto" and POSES not in drive.has:
         assert choose_ego_source(drive) == ("kiss_icp" if has_odometry() else "none")
-    fill(report, drive, by_tracker(lambda: detector, ego=ego), limit=FRAMES)
+    fill(report, drive, measure_tracking(lambda: detector, ego=ego), limit=FRAMES)
     cars = report.compute()["classes"]["Car"]
     assert cars["switches"] == 0 and cars["HOTA"] > 0.7

@@ -25,11 +25,11 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.points.clusters import (
     UNKNOWN,
     ClusterScores,
-    confusions,
-    labelled,
-    point_labels,
-    uncared,
-    unknown_where,
+    count_confusions,
+    find_unlabelled,
+    label_clusters,
+    label_points,
+    mask_unlabelled,
 )
 from lidar_perception.training.augment import TrainingScene, raise_scene
 from lidar_perception.training.data import SceneReader
@@ -94,17 +94,17 @@ BOXES = np.array([[10, 2, -0.9, 4, 1.7, 1.5, 0.4], [8, -6, -0.85, 0.7, 0.7, 1.75
 def test_cluster_gets_label_of_most_of_its_points(rng):
     names = ids("Car", "Pedestrian", "Cyclist", "Van")
     clusters = fill_boxes(rng, np.concatenate([BOXES, BOXES[:1] + [40, 0, 0, 0, 0, 0, 0]]))
-    labels, owners = labelled(clusters, BOXES, names, CONFIG.classes)
+    labels, owners = label_clusters(clusters, BOXES, names, CONFIG.classes)
     assert labels.tolist() == [0, 1, 2, UNKNOWN, 3] and owners.tolist() == [0, 1, 2, -1, -1]
     # a third in the box is neither object nor background, a tenth is background
     for share, wanted in ((0.9, 0), (0.3, UNKNOWN), (0.1, 3)):
         points = clusters.points[:60].copy()
         points[int(60 * share):, 2] += 5
         one = Clusters(points, np.array([0, 60]), np.array([1]))
-        assert labelled(one, BOXES, names, CONFIG.classes)[0].tolist() == [wanted]
-    none = labelled(clusters, np.zeros((0, 7)), ids(), CONFIG.classes)
+        assert label_clusters(one, BOXES, names, CONFIG.classes)[0].tolist() == [wanted]
+    none = label_clusters(clusters, np.zeros((0, 7)), ids(), CONFIG.classes)
     assert none[0].tolist() == [3] * 5 and none[1].tolist() == [-1] * 5
-    points = point_labels(clusters.points[:, :3], BOXES, names, CONFIG.classes)
+    points = label_points(clusters.points[:, :3], BOXES, names, CONFIG.classes)
     assert points.reshape(5, 60).tolist() == [[k] * 60 for k in (0, 1, 2, UNKNOWN, 3)]
 
 
@@ -119,12 +119,16 @@ def test_background_in_unlabelled_regions_is_unknown(rng):
     assert not camera.in_regions(xyz, np.zeros((0, 4))).any()
     clusters = fill_boxes(rng, BOXES[:3], 10)
     truth = GroundTruth.of(np.zeros((0, 7)), [], notes=(("DontCare", {"bbox": whole}),))
-    blind = uncared(truth, camera, clusters.points[:, :3])
-    assert blind.all() and not uncared(replace(truth, notes=()), camera,
-                                       clusters.points[:, :3]).any()
+    blind = find_unlabelled(truth, camera, clusters.points[:, :3])
+    assert blind.all() and not find_unlabelled(replace(truth, notes=()), camera,
+                                               clusters.points[:, :3]).any()
     blind[:14] = False  # the first cluster, and four tenths of the second
-    assert unknown_where(np.array([3, 3, 3]), clusters, blind, 3).tolist() == [3, UNKNOWN, UNKNOWN]
-    assert unknown_where(np.array([0, 1, 2]), clusters, blind, 3).tolist() == [0, 1, 2]
+    assert mask_unlabelled(np.array([3, 3, 3]), clusters, blind, 3).tolist() == [
+        3,
+        UNKNOWN,
+        UNKNOWN,
+    ]
+    assert mask_unlabelled(np.array([0, 1, 2]), clusters, blind, 3).tolist() == [0, 1, 2]
 
 
 def test_cluster_and_point_scores_agree_with_hand_count(rng):
@@ -134,9 +138,9 @@ def test_cluster_and_point_scores_agree_with_hand_count(rng):
     labels = np.array([0, 0, 1, 3, 0])  # right, missed, right, wrong; too small to count
     numbers = np.array([1, 1, 2, 3, 0, 0])
     truth = np.array([0, 3, 0, 1, 1, UNKNOWN])
-    scores.update(confusions(clusters, labels, Predictions(found, found.argmax(1),
-                                                           np.zeros((5, 7))), truth, numbers,
-                             CONFIG.classes))
+    scores.update(count_confusions(clusters, labels, Predictions(found, found.argmax(1),
+                                                                 np.zeros((5, 7))), truth, numbers,
+                                   CONFIG.classes))
     content = scores.compute()
     assert content["clusters"]["accuracy"] == 50.0
     assert content["clusters"]["object_accuracy"] == pytest.approx(200 / 3)

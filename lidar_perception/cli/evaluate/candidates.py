@@ -46,7 +46,7 @@ def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
       lidar-perception evaluate candidates drive.bag --config best --set seed.source=file
     """
     from lidar_perception.data.frame import BOXES
-    from lidar_perception.scoring.centres.report import CandidateReport, by_pipeline
+    from lidar_perception.scoring.centres.report import CandidateReport, measure_candidates
     from lidar_perception.scoring.centres.tables import print_candidate_report
 
     recording = walk.opened(BOXES)
@@ -54,7 +54,7 @@ def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
     if params.seed.source == "click":
         raise click.UsageError("there is nobody to click here; use --set seed.source=file")
     report = CandidateReport()
-    walk.fill(report, recording, partial(by_pipeline, params))
+    walk.fill(report, recording, partial(measure_candidates, params))
     if report.frames == 0:
         raise no_labels(recording, report.skipped, "a Pedestrian label")
     content = report.compute()
@@ -71,17 +71,18 @@ def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> Non
     from lidar_perception.rendering.colors import color_by_cluster
     from lidar_perception.rendering.files import write_png
     from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
-    from lidar_perception.scoring.centres.report import pedestrians_of, seed_source
+    from lidar_perception.scoring.centres.report import load_pedestrians, make_seed_source
     from lidar_perception.types import PointCloud
-    best = report.with_most()
+    best = report.find_most_crowded()
     if best is None:
         return
     template = None if params.seed.source == "ground_truth" else load_seed(params.seed.file)
     frame = next(frame for frame in recording if frame.name == best)
-    truth = pedestrians_of(frame, params.view.enabled)
+    truth = load_pedestrians(frame, params.view.enabled)
     scan = frame.load()
-    segmented, found = find_candidates(scan, seed_source(truth, template, params), frame.camera(),
-                                       params)
+    segmented, found = find_candidates(
+        scan, make_seed_source(truth, template, params), frame.camera(), params
+    )
     stage = Stage.of(scan, params.ground.sensor_pose.height, params.view.enabled)
     write_png(png, draw_frame(
         stage, PointCloud(segmented.xyz), Boxes(found.final.boxes, found.final.class_ids), truth,

@@ -54,14 +54,14 @@ def clusters(walk: Walk, weights: Path | None, settings: Settings) -> None:
     from lidar_perception.detectors.checkpoint import read_header
     from lidar_perception.detectors.pointnet.config import PointNetConfig
     from lidar_perception.scoring.points.cluster_tables import print_cluster_scores
-    from lidar_perception.scoring.points.clusters import ClusterScores, by_network
+    from lidar_perception.scoring.points.clusters import ClusterScores, measure_network
 
     file = _file(weights)
     values, = settings.values(_runs(weights)) if settings else [{}]
     checked(default_params(file), values)
     scores = ClusterScores(read_header(file, PointNetConfig).config.classes)
     recording = walk.opened(BOXES)
-    walk.fill(scores, recording, partial(by_network, file, values))
+    walk.fill(scores, recording, partial(measure_network, file, values))
     if not scores.frames:
         raise no_labels(recording, scores.skipped)
     content = {"source": str(weights or "the package's own"), **scores.compute()}

@@ -65,10 +65,10 @@ def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None,
     """
     from lidar_perception.data.frame import BOXES, CAMERA
     from lidar_perception.detectors.open import check_weights
-    from lidar_perception.scoring.detections import by_detector, by_files
-    from lidar_perception.scoring.kitti.box_errors import box_errors, print_box_errors
+    from lidar_perception.scoring.detections import measure_detector, measure_result_files
+    from lidar_perception.scoring.kitti.box_errors import measure_box_errors, print_box_errors
     from lidar_perception.scoring.kitti.protocol import SCORED, Comparison
-    from lidar_perception.scoring.kitti.reliability import print_reliability, reliability
+    from lidar_perception.scoring.kitti.reliability import measure_reliability, print_reliability
     from lidar_perception.scoring.kitti.report import DetectionReport
     from lidar_perception.scoring.kitti.tables import print_detection_report, print_intervals
     from lidar_perception.scoring.run import Start
@@ -92,14 +92,15 @@ def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None,
     if results is not None:
         if not results.is_dir():
             raise InputError(f"{results} is not a folder; give the folder of the result files")
-        start = partial(by_files, results)
+        start = partial(measure_result_files, results)
     else:
         assert detector is not None  # as there are no --results
         height = recording.frames[0].sensor_height
         for doubt in check_weights(Path(detector.weights), height):
             terminal_errors.print(doubt)
-        start = by_detector(partial(detector.open, min_score=min_score, sensor_height=height), keep,
-                            write_results)
+        start = measure_detector(
+            partial(detector.open, min_score=min_score, sensor_height=height), keep, write_results
+        )
     if CAMERA not in recording.has and (results is not None or write_results is not None):
         terminal_errors.print(f"{recording.path} has no camera calibration: result files are in "
                               "the frame of a nominal camera, as detect writes them", style="dim")
@@ -112,9 +113,11 @@ def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None,
     content = {"source": str(results if detector is None else detector.weights), "keep": keep,
                **report.compute()}
     if errors and report.frames:
-        together = Comparison.of(report.frames)
-        content["errors"] = {name: box_errors(report.frames, name, errors_from) for name in SCORED}
-        content["reliability"] = {name: reliability(together, name) for name in SCORED}
+        concatenate = Comparison.of(report.frames)
+        content["errors"] = {
+            name: measure_box_errors(report.frames, name, errors_from) for name in SCORED
+        }
+        content["reliability"] = {name: measure_reliability(concatenate, name) for name in SCORED}
     if intervals and report.frames:
         content["intervals"] = report.intervals(intervals)
     if report.frames:

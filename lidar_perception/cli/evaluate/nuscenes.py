@@ -40,7 +40,11 @@ def nuscenes(walk: Walk, results: Path | None, detector: DetectorChoice | None,
     """
     from lidar_perception.data.nuscenes.folder import KeyFrame
     from lidar_perception.data.nuscenes.results import write_results as write_result_file
-    from lidar_perception.scoring.nuscenes.report import NuscenesReport, by_detector, by_file
+    from lidar_perception.scoring.nuscenes.report import (
+        NuscenesReport,
+        measure_key_frames,
+        measure_result_file,
+    )
     from lidar_perception.scoring.nuscenes.tables import print_nuscenes_report
 
     if (results is None) == (detector is None):
@@ -54,11 +58,11 @@ def nuscenes(walk: Walk, results: Path | None, detector: DetectorChoice | None,
         raise InputError(f"{walk.data} ({recording.layout}) is not nuScenes; use evaluate "
                          "detection")
     if results is not None:
-        start = partial(by_file, results)
+        start = partial(measure_result_file, results)
     else:
         assert detector is not None  # as there are no --results
         open_ = partial(detector.open, min_score=MIN_SCORE, sensor_height=first.sensor_height)
-        start = partial(by_detector, open_, write_results is not None)
+        start = partial(measure_key_frames, open_, write_results is not None)
     report = NuscenesReport()
     walk.fill(report, recording, start)
     if write_results is not None:

@@ -65,7 +65,7 @@ def segmentation(walk: Walk, methods: tuple, png: Path | None, params: Segmentat
       lidar-perception evaluate segmentation drive.bag --methods dbscan --json scores.json
     """
     from lidar_perception.data.frame import BOXES, POINT_LABELS
-    from lidar_perception.scoring.points.report import SegmentationReport, by_methods
+    from lidar_perception.scoring.points.report import SegmentationReport, measure_methods
     from lidar_perception.scoring.points.tables import draw_ground, print_scores
 
     grounds = tuple(name for name in GROUND_METHODS if name in methods)
@@ -86,7 +86,7 @@ def segmentation(walk: Walk, methods: tuple, png: Path | None, params: Segmentat
     for recording in recordings:
         report.source = recording.layout
         own = as_mounted(recording, params)
-        walk.fill(report, recording, partial(by_methods, own, grounds, clusterings),
+        walk.fill(report, recording, partial(measure_methods, own, grounds, clusterings),
                   recording.layout)
     if not (report.ground or report.clusters):
         raise no_labels(recordings[0], report.skipped)
@@ -97,10 +97,10 @@ def segmentation(walk: Walk, methods: tuple, png: Path | None, params: Segmentat
     print_scores(content, params.ground.method, console)
     walk.write(content)
     if png is not None:
-        from lidar_perception.scoring.points.report import ground_of_methods
+        from lidar_perception.scoring.points.report import segment_by_methods
         own = as_mounted(labelled[0], params)
         for frame in islice(labelled[0], walk.limit):
-            scan, labels, found = ground_of_methods(frame, own, grounds)
+            scan, labels, found = segment_by_methods(frame, own, grounds)
             if labels is not None:
                 draw_ground(png, frame.name, scan, labels.classes, found)
                 break

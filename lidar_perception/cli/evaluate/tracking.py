@@ -48,7 +48,7 @@ def tracking(data: Path, split: Path | None, limit: int | None, detector: Detect
     """
     from lidar_perception.data.frame import BOXES, POSES
     from lidar_perception.scoring.run import fill
-    from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker
+    from lidar_perception.scoring.tracking.report import TrackingReport, measure_tracking
     from lidar_perception.scoring.tracking.tables import print_tracking_report
     from lidar_perception.tracking.drive_tracker import choose_ego_source
 
@@ -61,7 +61,7 @@ def tracking(data: Path, split: Path | None, limit: int | None, detector: Detect
         console.print(Text("no pose", "yellow") + ": the first frames have none, so poses are by "
                       "KISS-ICP; see whether the odometry or TF of the recording has the clock of "
                       "its clouds")
-    fill(report, recording, by_tracker(open_, tracking, ego), limit=limit)
+    fill(report, recording, measure_tracking(open_, tracking, ego), limit=limit)
     if not report.frames:
         raise no_labels(recording, report.skipped)
     content = {"source": detector.weights, "ego": ego, **report.compute()}

@@ -15,10 +15,10 @@ def match_centres(found: np.ndarray, truth: np.ndarray,
     """Pairs (P,), (P,) of row numbers of found (K, >=3) and truth (M, >=3) whose 3D centres are at
     most max_distance apart, one to one: as many pairs as possible, then the least distance."""
     distance = np.linalg.norm(found[:, None, :3].astype(float) - truth[None, :, :3], axis=2)
-    return one_to_one(distance, distance <= max_distance)  # a centre that is NaN is far from all
+    return assign_pairs(distance, distance <= max_distance)  # a centre that is NaN is far from all
 
 
-def one_to_one(cost: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def assign_pairs(cost: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows (P,) and columns (P,) of pairs for cost (K, M), none negative, of which only those
     under allowed (K, M) bool can be: as many pairs as possible, then the least sum."""
     # One forbidden pair costs more than all allowed ones together.
@@ -28,20 +28,20 @@ def one_to_one(cost: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.nd
     return rows[keep], columns[keep]
 
 
-def range_bins(boxes: np.ndarray) -> np.ndarray:
+def find_range_bins(boxes: np.ndarray) -> np.ndarray:
     """(K,) index into RANGE_NAMES of the horizontal range of box centres (K, >=2)."""
     return np.searchsorted(RANGE_LIMITS, np.hypot(boxes[:, 0], boxes[:, 1]), side="right")
 
 
-def counts_by_range(found: np.ndarray, truth: np.ndarray, pairs: tuple[np.ndarray, np.ndarray],
-                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def count_by_range(found: np.ndarray, truth: np.ndarray, pairs: tuple[np.ndarray, np.ndarray],
+                   ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """True positives, false positives, misses (5,) int and summed centre errors (5,) metres of one
     frame, by RANGE_NAMES: found boxes (K, 7), true boxes (M, 7), pairs of match_centres.
 
     A true positive and a miss belong to the range of the true object, a false positive to its own.
     """
     i, j = pairs
-    true_bin, found_bin = range_bins(truth), range_bins(found)
+    true_bin, found_bin = find_range_bins(truth), find_range_bins(found)
     bins = len(RANGE_NAMES)
     hits = np.bincount(true_bin[j], minlength=bins)
     misses = np.bincount(true_bin, minlength=bins) - hits
@@ -59,7 +59,7 @@ class Score:
 
     def update(self, found: np.ndarray, truth: np.ndarray) -> None:
         """One frame: found boxes (K, 7), true boxes (M, 7)."""
-        counts = counts_by_range(found, truth, match_centres(found, truth))
+        counts = count_by_range(found, truth, match_centres(found, truth))
         for total, count in zip((self.tp, self.fp, self.fn, self.error), counts):
             total += count
 

@@ -21,25 +21,25 @@ from lidar_perception.candidates.seed_sources import (
 from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame, Recording
-from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, range_bins
-from lidar_perception.scoring.kitti.camera_objects import in_image
+from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, find_range_bins
+from lidar_perception.scoring.kitti.camera_objects import select_in_image
 from lidar_perception.types import PEDESTRIAN, GroundTruth, InputError
 
-TIMES = 10_000  # of a step that are kept
+MAX_TIMES = 10_000  # of a step that are kept
 
 
-def pedestrians(truth: GroundTruth | None) -> np.ndarray:
+def select_pedestrians(truth: GroundTruth | None) -> np.ndarray:
     """(M, 7) true Pedestrian boxes; none where there are no labels."""
     return np.zeros((0, 7)) if truth is None else truth.of_class(PEDESTRIAN)
 
 
-def pedestrians_of(frame: Frame, view: bool = True) -> np.ndarray:
+def load_pedestrians(frame: Frame, view: bool = True) -> np.ndarray:
     """(M, 7) true Pedestrian boxes of a frame; with view, where only the points in the camera's
     view are looked at, those of which a part is in its image."""
     truth = frame.truth()
-    if view and truth is not None and len(pedestrians(truth)):
-        truth = in_image(truth, frame.calibration())
-    return pedestrians(truth)
+    if view and truth is not None and len(select_pedestrians(truth)):
+        truth = select_in_image(truth, frame.calibration())
+    return select_pedestrians(truth)
 
 
 @dataclass(frozen=True)
@@ -54,36 +54,38 @@ class CandidateResult:
     name: str = ""
 
 
-def by_pipeline(params: PipelineParams, recording: Recording
-                ) -> Callable[[Frame], CandidateResult | None]:
+def measure_candidates(params: PipelineParams, recording: Recording
+                       ) -> Callable[[Frame], CandidateResult | None]:
     """Runs the candidate pipeline on every frame with a pedestrian, as paper A does. With params a
     Start of scoring.run."""
     warm_up()
     template = None if params.seed.source == "ground_truth" else load_seed(params.seed.file)
-    return partial(of_frame, params=params, template=template)
+    return partial(measure_frame, params=params, template=template)
 
 
-def of_frame(frame: Frame, params: PipelineParams,
-             template: Seed | None = None) -> CandidateResult | None:
+def measure_frame(frame: Frame, params: PipelineParams,
+                  template: Seed | None = None) -> CandidateResult | None:
     """The pipeline on one frame, with the seed of seed_source(); None without a pedestrian."""
-    truth = pedestrians_of(frame, params.view.enabled)
+    truth = load_pedestrians(frame, params.view.enabled)
     if len(truth) == 0:
         return None
     scan, camera = frame.load(), frame.camera()
     try:
-        _, found = find_candidates(scan, seed_source(truth, template, params), camera, params)
+        _, found = find_candidates(scan, make_seed_source(truth, template, params), camera, params)
     except InputError as error:  # no seed, or no camera: this frame has no candidates
-        return CandidateResult(truth, boxes_by_stage(Candidates.none()), {},
+        return CandidateResult(truth, collect_boxes(Candidates.none()), {},
                                f"{frame.name}: {error}")
-    return CandidateResult(truth, boxes_by_stage(found), found.ms, name=frame.name)
+    return CandidateResult(truth, collect_boxes(found), found.ms, name=frame.name)
 
 
-def boxes_by_stage(candidates: Candidates) -> dict[str, np.ndarray]:
+def collect_boxes(candidates: Candidates) -> dict[str, np.ndarray]:
     """Name of each stage to its boxes (K, 7)."""
     return {stage: getattr(candidates, stage).boxes for stage in STAGES}
 
 
-def seed_source(truth: np.ndarray, template: Seed | None, params: PipelineParams) -> SeedSource:
+def make_seed_source(
+    truth: np.ndarray, template: Seed | None, params: PipelineParams
+) -> SeedSource:
     """Where a frame's seed comes from: its true pedestrians (M, 7) without a template, the paper's
     protocol, else what params say."""
     if template is None:
@@ -106,7 +108,7 @@ class CandidateReport:
     skipped: list[str] = field(default_factory=list)
     most: tuple[int, str | None] = 0, None
 
-    def with_most(self) -> str | None:
+    def find_most_crowded(self) -> str | None:
         """Name of the frame with most pedestrians, the first of several, of those where nothing
         was wrong; None without one."""
         return self.most[1]
@@ -116,7 +118,7 @@ class CandidateReport:
         if result.problem is not None:
             self.skipped.append(result.problem)
         self.frames += 1
-        self.true_by_range += np.bincount(range_bins(result.truth), minlength=len(RANGE_NAMES))
+        self.true_by_range += np.bincount(find_range_bins(result.truth), minlength=len(RANGE_NAMES))
         if result.name and len(result.truth) > self.most[0]:
             self.most = len(result.truth), result.name
         for stage, boxes in result.boxes.items():
@@ -127,7 +129,7 @@ class CandidateReport:
     def update_times(self, ms: dict[str, float]) -> None:
         """Times of steps that come by themselves, as from the topics of nodes."""
         for step, value in ms.items():
-            self.times.setdefault(step, deque(maxlen=TIMES)).append(value)
+            self.times.setdefault(step, deque(maxlen=MAX_TIMES)).append(value)
 
     def compute(self) -> dict:
         """What the JSON file holds."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lidar_perception.scoring.centres.matching import Score, match_centres
-from lidar_perception.scoring.intervals import blocks, interval
+from lidar_perception.scoring.intervals import compute_interval, group_frames
 
 
 @dataclass
@@ -56,8 +56,8 @@ class CentreScores:
             total.update(boxes[scores >= min_score], truth)
         return total.table()
 
-    def f1_interval(self, min_score: float, count: int, follow: bool = False
-                    ) -> list[float] | None:
+    def compute_f1_interval(self, min_score: float, count: int, follow: bool = False
+                            ) -> list[float] | None:
         """[low, high] of F1 in percent for detections that score min_score or more, from `count`
         drawings of blocks(names, follow); see intervals.py."""
         found = [boxes[scores >= min_score] for _, boxes, scores in self.frames]
@@ -68,7 +68,7 @@ class CentreScores:
             hits, boxes, true = counts[frames].sum(axis=0)
             return 200 * hits / (boxes + true)
 
-        return interval(f1, blocks(self.names, follow), count)
+        return compute_interval(f1, group_frames(self.names, follow), count)
 
     def compute(self) -> dict:
         """What the JSON file holds."""

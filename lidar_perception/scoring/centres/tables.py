@@ -7,31 +7,41 @@ from rich.console import Console
 from lidar_perception.candidates.refine import STAGES
 from lidar_perception.scoring.centres.matching import RANGE_NAMES
 from lidar_perception.scoring.centres.paper import TABLE_6
-from lidar_perception.scoring.tables import counts, narrow_table, number, percent, print_skipped
+from lidar_perception.scoring.tables import (
+    format_counts,
+    format_number,
+    format_percent,
+    make_table,
+    print_skipped,
+)
 
 STAGE_TITLES = {"stage1": "clusters", "stage2": "STM", "final": "STM + CPA"}
 
 
 def print_candidate_report(content: dict, console: Console) -> None:
     """Scores by range and stage, beside the paper's overall figures, and times of the steps."""
-    table = narrow_table(f"{content['ground_truth']} pedestrians in {content['frames']} frames, "
-                         "hit = 3D centre within 1.0 m", "stage", "range [m]", "TP", "FP", "FN",
-                         "recall", "prec.", "F1", "error [m]", width=6)
+    table = make_table(f"{content['ground_truth']} pedestrians in {content['frames']} frames, "
+                       "hit = 3D centre within 1.0 m", "stage", "range [m]", "TP", "FP", "FN",
+                       "recall", "prec.", "F1", "error [m]", width=6)
     for stage in [s for s in STAGES if s in content]:
         for name in (*RANGE_NAMES, "all"):
             row = content[stage][name]
             if row["tp"] + row["fp"] + row["fn"] == 0 and name != "all":
                 continue
-            table.add_row(STAGE_TITLES[stage] if name == "all" else "", name,
-                          *counts(row, "tp", "fp", "fn"),
-                          *percent(row, "recall", "precision", "f1"), number(row["centre_error_m"]),
-                          style="bold" if name == "all" else "")
+            table.add_row(
+                STAGE_TITLES[stage] if name == "all" else "",
+                name,
+                *format_counts(row, "tp", "fp", "fn"),
+                *format_percent(row, "recall", "precision", "f1"),
+                format_number(row["centre_error_m"]),
+                style="bold" if name == "all" else "",
+            )
         recall, precision, f1, _, error = TABLE_6[stage]
         table.add_row("  the paper", "all", "", "", "", f"{recall}", f"{precision}", f"{f1}",
                       f"{error:.2f}", style="dim", end_section=True)
     console.print(table)
     if content["ms"]:
-        times = narrow_table("Median time a frame", "step", "ms", width=7)
+        times = make_table("Median time a frame", "step", "ms", width=7)
         for step, ms in content["ms"].items():
             times.add_row(step, f"{ms:.2f}", style="bold" if step == "total" else "")
         console.print(times)

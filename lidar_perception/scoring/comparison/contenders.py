@@ -38,7 +38,7 @@ from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file as pointpillars_file
 from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.param_fields import with_values
-from lidar_perception.scoring.centres.report import pedestrians_of
+from lidar_perception.scoring.centres.report import load_pedestrians
 from lidar_perception.scoring.comparison.outcomes import Contender
 from lidar_perception.types import CLASSES, PEDESTRIAN, SENSOR_HEIGHT, InputError
 
@@ -185,7 +185,7 @@ def _no_seed(segmented):
 
 def _labelled(frame: Frame) -> SeedSource | None:
     """The paper's seed: the nearest label; None in frames without a pedestrian."""
-    truth = pedestrians_of(frame)
+    truth = load_pedestrians(frame)
     return make_truth_source(truth) if len(truth) else None
 
 

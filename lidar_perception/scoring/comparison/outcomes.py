@@ -13,7 +13,7 @@ import numpy as np
 
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.contract import Detector
-from lidar_perception.scoring.detections import Detected, detected
+from lidar_perception.scoring.detections import FrameDetections, run_detector
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED
 from lidar_perception.scoring.kitti.report import ROWS, DetectionReport
 from lidar_perception.types import Detections
@@ -38,13 +38,13 @@ class Contender:
 
 
 def by_contenders(open_: Callable[[], list[Contender]], recording: Recording
-                  ) -> Callable[[Frame], dict[str, Detected[Detections]] | None]:
+                  ) -> Callable[[Frame], dict[str, FrameDetections[Detections]] | None]:
     """Runs every contender that open_() gives on every frame with labels, in turns; gives their
     Detected by name. The first frame is run once more before it counts, as a first run also loads
     what was compiled. With open_ a Start of scoring.run."""
     contenders, state = open_(), {"turn": 0}
 
-    def measure(frame: Frame) -> dict[str, Detected[Detections]] | None:
+    def measure(frame: Frame) -> dict[str, FrameDetections[Detections]] | None:
         truth, calibration = frame.truth(), frame.calibration()
         if truth is None:
             return None
@@ -58,12 +58,12 @@ def by_contenders(open_: Callable[[], list[Contender]], recording: Recording
     return measure
 
 
-def _one(contender: Contender, frame: Frame) -> Detected[Detections]:
+def _one(contender: Contender, frame: Frame) -> FrameDetections[Detections]:
     """What a contender says of a frame, without boxes that are not finite."""
     detector = contender.detector_of(frame)
     if detector is None:
-        return Detected(frame.name, frame.truth(), Detections.none(), frame.calibration())
-    result = detected(detector, frame, frame.truth(), frame.calibration())
+        return FrameDetections(frame.name, frame.truth(), Detections.none(), frame.calibration())
+    result = run_detector(detector, frame, frame.truth(), frame.calibration())
     boxes, scores = result.detections.boxes, result.detections.scores
     sound = np.isfinite(np.column_stack([boxes, scores])).all(axis=1)
     if sound.all():
@@ -97,7 +97,7 @@ class ComparisonReport:
         """Whose frames and labels are those of all."""
         return next(iter(self.reports.values()))
 
-    def update(self, results: dict[str, Detected[Detections]]) -> None:
+    def update(self, results: dict[str, FrameDetections[Detections]]) -> None:
         """One frame."""
         for name, result in results.items():
             self.reports[name].update(result)
@@ -121,7 +121,7 @@ def outcome(contender: Contender, report: DetectionReport, drawings: int = 0) ->
     intervals = {"intervals": {
         "ap": {name: rows if name in contender.classes else None
                for name, rows in report.intervals(drawings).items()},
-        "f1": centres.f1_interval(contender.operating, drawings, report.follow)}
+        "f1": centres.compute_f1_interval(contender.operating, drawings, report.follow)}
         } if drawings else {}
     return {
         "weights": contender.source, "classes": list(contender.classes),

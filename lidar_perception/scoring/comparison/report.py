@@ -10,19 +10,19 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from lidar_perception.scoring.average_precision import FEW
+from lidar_perception.scoring.average_precision import MIN_OBJECTS
 from lidar_perception.scoring.comparison.outcomes import AP_ROWS
-from lidar_perception.scoring.intervals import SHARE
+from lidar_perception.scoring.intervals import INTERVAL_PERCENT
 from lidar_perception.scoring.kitti.protocol import RELAXED, SCORED, STRICT
 from lidar_perception.scoring.kitti.report import INTERVALS
 from lidar_perception.scoring.kitti.tables import CENTRE_F1
 from lidar_perception.scoring.pictures import save_picture
 from lidar_perception.scoring.tables import (
-    between,
-    counts,
-    narrow_table,
-    number,
-    percent,
+    format_counts,
+    format_interval,
+    format_number,
+    format_percent,
+    make_table,
     print_skipped,
 )
 
@@ -52,18 +52,18 @@ def print_comparison(content: dict, console: Console) -> None:
 
 def _print_precision(content: dict, console: Console) -> None:
     titles = [title for name in SCORED for title in (name[:3], "", "", "")]
-    table = narrow_table(f"AP (R40, moderate), {content['frames']} frames", "", *titles, width=5)
+    table = make_table(f"AP (R40, moderate), {content['frames']} frames", "", *titles, width=5)
     table.add_row("", *(SHORT[row] for _ in SCORED for row in AP_ROWS), style="dim")
     table.add_row("overlap above", *(f"{(RELAXED if 'relaxed' in row else STRICT)[name]:g}"
                                      for name in SCORED for row in AP_ROWS), style="dim",
                   end_section=True)
     for name, row in content["rows"].items():
-        table.add_row(name, *(number(None if row["ap"][each] is None else
-                                      row["ap"][each][which]["moderate"])
+        table.add_row(name, *(format_number(None if row["ap"][each] is None else
+                                             row["ap"][each][which]["moderate"])
                               for each in SCORED for which in AP_ROWS))
     labels = {name: content["objects"][name]["moderate"] for name in SCORED}
     table.caption = "Labels: " + ", ".join(
-        f"{name} {n}{'*' * (0 < n < FEW)}" for name, n in labels.items()) + (
+        f"{name} {n}{'*' * (0 < n < MIN_OBJECTS)}" for name, n in labels.items()) + (
         ". BEV: from above, 3D: in space. * too few for KITTI's own sampling of recall, so read "
         "off the whole curve. A dash: not a class of the detector, or no label.")
     console.print(table)
@@ -71,16 +71,23 @@ def _print_precision(content: dict, console: Console) -> None:
 
 def _print_pedestrians(content: dict, console: Console) -> None:
     centres = content["pedestrians"]
-    table = narrow_table(f"Pedestrians within 1.0 m ({centres['ground_truth']} in "
-                         f"{centres['frames']} frames), and time of a whole detector", "",
-                         "score", "TP", "FP", "FN", "prec.", "recall", "F1", "best", "from", "ms",
-                         "runs", "failed", width=4)
+    table = make_table(f"Pedestrians within 1.0 m ({centres['ground_truth']} in "
+                       f"{centres['frames']} frames), and time of a whole detector", "",
+                       "score", "TP", "FP", "FN", "prec.", "recall", "F1", "best", "from", "ms",
+                       "runs", "failed", width=4)
     for name, row in content["rows"].items():
         used, best = (row["pedestrian_centres"][key] for key in ("operating", "best"))
-        table.add_row(name, f"{used['score']:.2f}", *counts(used, "tp", "fp", "fn"),
-                      *percent(used, "precision", "recall", "f1"),
-                      *percent(best, "f1"), number(best["score"]), number(row["ms"]),
-                      str(row["frames"]), str(len(row["failed"])))
+        table.add_row(
+            name,
+            f"{used['score']:.2f}",
+            *format_counts(used, "tp", "fp", "fn"),
+            *format_percent(used, "precision", "recall", "f1"),
+            *format_percent(best, "f1"),
+            format_number(best["score"]),
+            format_number(row["ms"]),
+            str(row["frames"]),
+            str(len(row["failed"])),
+        )
     table.add_section()
     for name, f1 in CENTRE_F1.items():
         table.add_row(f"paper: {name}", *[""] * 6, f"{100 * f1:.1f}", style="dim")
@@ -97,15 +104,15 @@ def _print_intervals(content: dict, console: Console) -> None:
     if not rows:
         return
     shown = INTERVALS[0], INTERVALS[-1]
-    table = narrow_table(f"{SHARE} % intervals, drawn by drive", "",
-                         *(f"{name[:3]} {SHORT[row]}" for name in SCORED for row in shown),
-                         "F1", width=7)
+    table = make_table(f"{INTERVAL_PERCENT} % intervals, drawn by drive", "",
+                       *(f"{name[:3]} {SHORT[row]}" for name in SCORED for row in shown),
+                       "F1", width=7)
     table.add_row("overlap above", *(f"{(RELAXED if 'relaxed' in row else STRICT)[name]:g}"
                                      for name in SCORED for row in shown), style="dim",
                   end_section=True)
     for name, said in rows.items():
-        table.add_row(name, *(between(said["ap"][each] and said["ap"][each][row])
-                              for each in SCORED for row in shown), between(said["f1"]))
+        table.add_row(name, *(format_interval(said["ap"][each] and said["ap"][each][row])
+                              for each in SCORED for row in shown), format_interval(said["f1"]))
     table.caption = "AP of moderate labels; F1 of pedestrians at the score in use."
     console.print(table)
 

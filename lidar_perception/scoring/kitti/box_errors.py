@@ -10,18 +10,18 @@ from rich.console import Console
 
 from lidar_perception.classes import DETECTED
 from lidar_perception.geometry import bev_and_3d_iou, horizontal_range, wrap_line
-from lidar_perception.scoring.kitti.matched_heights import matched_boxes
+from lidar_perception.scoring.kitti.matched_heights import match_boxes
 from lidar_perception.scoring.kitti.protocol import ComparedFrame
-from lidar_perception.scoring.tables import narrow_table
+from lidar_perception.scoring.tables import make_table
 
 RANGES = (0.0, 15.0, 30.0, 45.0, np.inf)  # metres
 ERRORS = ("away", "aside", "bottom", "length", "width", "height", "yaw")
 # What is put right -> the columns of a box.
-RIGHT = {"as it is": [], "z": [2], "x, y": [0, 1], "x, y, z": [0, 1, 2], "length": [3],
-         "width": [4], "height": [5], "yaw": [6]}
+CORRECTIONS = {"as it is": [], "z": [2], "x, y": [0, 1], "x, y, z": [0, 1, 2], "length": [3],
+               "width": [4], "height": [5], "yaw": [6]}
 
 
-def box_errors(frames: list[ComparedFrame], name: str, min_score: float) -> dict[str, Any]:
+def measure_box_errors(frames: list[ComparedFrame], name: str, min_score: float) -> dict[str, Any]:
     """Of the class called name, true boxes paired with the found box of min_score or more that
     overlaps them most from above, if by more than the relaxed overlap of the class.
 
@@ -30,19 +30,33 @@ def box_errors(frames: list[ComparedFrame], name: str, min_score: float) -> dict
     its left (aside), bottom, sizes; yaw modulo half a turn. strict: by what is put right (RIGHT),
     the percentage of pairs beyond the strict overlap, in `space` and `above`. None without pairs.
     """
-    found, true = matched_boxes(frames, name, min_score)
-    differences, away = _differences(found, true), horizontal_range(true)
+    found, true = match_boxes(frames, name, min_score)
+    differences, away = _compute_differences(found, true), horizontal_range(true)
     bands = {f"{low:g}-{high:g} m".replace("-inf m", " m -"): (away >= low) & (away < high)
              for low, high in pairwise(RANGES)} | {"all": np.ones(len(true), bool)}
-    return {"min_score": min_score, "by_range": {
-        title: {"pairs": int(own.sum()), **{
-            error: {"median": _median(values[own]), "median_size": _median(np.abs(values[own]))}
-            for error, values in differences.items()}} for title, own in bands.items()},
-        "strict": {title: _reached(found, true, columns, DETECTED[name].strict)
-                   for title, columns in RIGHT.items()}}
+    return {
+        "min_score": min_score,
+        "by_range": {
+            title: {
+                "pairs": int(own.sum()),
+                **{
+                    error: {
+                        "median": _compute_median(values[own]),
+                        "median_size": _compute_median(np.abs(values[own])),
+                    }
+                    for error, values in differences.items()
+                },
+            }
+            for title, own in bands.items()
+        },
+        "strict": {
+            title: _measure_overlaps(found, true, columns, DETECTED[name].strict)
+            for title, columns in CORRECTIONS.items()
+        },
+    }
 
 
-def _differences(found: np.ndarray, true: np.ndarray) -> dict[str, np.ndarray]:
+def _compute_differences(found: np.ndarray, true: np.ndarray) -> dict[str, np.ndarray]:
     """By ERRORS, (P,)."""
     azimuth = np.arctan2(true[:, 1], true[:, 0])
     x, y, z, *sizes, yaw = (found - true).T
@@ -51,8 +65,8 @@ def _differences(found: np.ndarray, true: np.ndarray) -> dict[str, np.ndarray]:
                              wrap_line(yaw))))
 
 
-def _reached(found: np.ndarray, true: np.ndarray, columns: list[int],
-             least: float) -> dict[str, float | None]:
+def _measure_overlaps(found: np.ndarray, true: np.ndarray, columns: list[int],
+                      least: float) -> dict[str, float | None]:
     """Percentage of pairs beyond the overlap, once these columns are the true ones."""
     if len(found) == 0:
         return {"space": None, "above": None}
@@ -64,7 +78,7 @@ def _reached(found: np.ndarray, true: np.ndarray, columns: list[int],
             "above": 100 * float((above > least).mean())}
 
 
-def _median(values: np.ndarray) -> float | None:
+def _compute_median(values: np.ndarray) -> float | None:
     return float(np.median(values)) if len(values) else None
 
 
@@ -73,25 +87,29 @@ def print_box_errors(errors: dict[str, dict[str, Any]], console: Console) -> Non
     for name, content in errors.items():
         if content["by_range"]["all"]["pairs"] == 0:
             continue
-        table = narrow_table(f"{name}: found minus true, median, and median of its size",
-                             "", "pairs", *ERRORS, width=6)
+        table = make_table(f"{name}: found minus true, median, and median of its size",
+                           "", "pairs", *ERRORS, width=6)
         for title, row in content["by_range"].items():
-            table.add_row(title, str(row["pairs"]), *(_signed(row[e]["median"]) for e in ERRORS))
-            table.add_row("", "", *(_size(row[e]["median_size"]) for e in ERRORS), style="dim")
+            table.add_row(
+                title, str(row["pairs"]), *(_format_signed(row[e]["median"]) for e in ERRORS)
+            )
+            table.add_row(
+                "", "", *(_format_size(row[e]["median_size"]) for e in ERRORS), style="dim"
+            )
         table.caption = (f"Metres, yaw in radians; boxes with a score of {content['min_score']:g} "
                          "or more. away, aside: of the centre, along the ray from the sensor and "
                          "to its left.")
         console.print(table)
-        table = narrow_table(f"{name}: pairs beyond the overlap {DETECTED[name].strict:g}, %",
-                             "put right", *RIGHT, width=7)
+        table = make_table(f"{name}: pairs beyond the overlap {DETECTED[name].strict:g}, %",
+                           "put right", *CORRECTIONS, width=7)
         for view, title in (("space", "in space"), ("above", "from above")):
             table.add_row(title, *(f"{row[view]:.0f}" for row in content["strict"].values()))
         console.print(table)
 
 
-def _signed(value: float | None) -> str:
+def _format_signed(value: float | None) -> str:
     return "" if value is None else f"{value:+.2f}"
 
 
-def _size(value: float | None) -> str:
+def _format_size(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}"

@@ -16,7 +16,7 @@ from lidar_perception.types import Detections, GroundTruth, InputError, class_id
 NO_ANGLE = -10.0          # KITTI's alpha where there is none
 # Truncation levels of the tracking layout: 0 inside, 1 across the border of the image, 2 ends of
 # tracks; of the raw one: 2 outside, 99 behind. From 2 on nobody is asked to find the object.
-LEFT_OUT = 2
+IGNORED_LEVEL = 2
 
 
 @dataclass(frozen=True)
@@ -55,19 +55,19 @@ class CameraObjects:
                              regions=self.regions)
 
     @staticmethod
-    def together(parts: list[CameraObjects]) -> CameraObjects:
+    def concatenate(parts: list[CameraObjects]) -> CameraObjects:
         """The objects of one frame or more, behind one another."""
         return CameraObjects(*(np.concatenate([getattr(part, f.name) for part in parts])
                                for f in fields(CameraObjects)))
 
 
-def scored_labels(detections: Detections) -> GroundTruth:
+def to_scored_labels(detections: Detections) -> GroundTruth:
     """Detections as labels with a score."""
     return GroundTruth.of(detections.boxes, detections.class_ids,
                           [{"score": float(score)} for score in detections.scores])
 
 
-def camera_objects(objects: GroundTruth, calibration: Calibration | None) -> CameraObjects:
+def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> CameraObjects:
     """Labels, or detections with their score in extras; notes come last.
 
     What a label file says is taken as it is; what it does not say (a 2D box, alpha) is computed
@@ -75,48 +75,58 @@ def camera_objects(objects: GroundTruth, calibration: Calibration | None) -> Cam
     tracking and raw layouts: the share of the projected box that lies outside the image.
     InputError where a box or a score is not finite.
     """
-    scores = np.array([extra.get("score", 1.0) for extra in _extras(objects)])
+    scores = np.array([extra.get("score", 1.0) for extra in _list_extras(objects)])
     bad = ~np.isfinite(scores)
     bad[:len(objects)] |= ~np.isfinite(objects.boxes).all(axis=1)
     if bad.any():
         raise InputError(f"box {np.argmax(bad) + 1} of {len(bad)} or its score is not finite; a "
                          "detector must leave such boxes out")
     if calibration is None:
-        return _without_camera(objects, scores[:len(objects)])
+        return _make_without_camera(objects, scores[:len(objects)])
     labels = to_labels(objects, calibration.lidar_to_camera)
     projected, outside = np.zeros((len(labels), 4)), np.zeros(len(labels))
     pixels, outside[:len(objects)] = project_boxes(objects.boxes, calibration)
     projected[:len(objects)] = np.nan_to_num(pixels)
 
-    given = _columns(labels, "bbox", 4)
+    given = _read_columns(labels, "bbox", 4)
     has_pixels = (given[:, 2:] > given[:, :2]).all(axis=1, keepdims=True)
-    sides = np.maximum(_columns(labels, "dimensions", 3), 0)
-    location, turn = _columns(labels, "location", 3), _columns(labels, "rotation_y")
-    alpha = _columns(labels, "alpha")
+    sides = np.maximum(_read_columns(labels, "dimensions", 3), 0)
+    location, turn = _read_columns(labels, "location", 3), _read_columns(labels, "rotation_y")
+    alpha = _read_columns(labels, "alpha")
     whole = sides.all(axis=1)  # not a 2D box only
     bearing = np.arctan2(location[:, 0], location[:, 2])
     computed = np.where(whole, wrap_angle(turn - bearing), np.nan)
     return CameraObjects(
         class_ids=np.array(class_ids(label["class"] for label in labels), np.int32),
-        boxes=np.column_stack([location[:, 2], -location[:, 0], sides[:, 0] / 2 - location[:, 1],
-                               sides[:, [2, 1, 0]], -turn - np.pi / 2]),
+        boxes=np.column_stack(
+            [
+                location[:, 2],
+                -location[:, 0],
+                sides[:, 0] / 2 - location[:, 1],
+                sides[:, [2, 1, 0]],
+                -turn - np.pi / 2,
+            ]
+        ),
         image_boxes=np.where(has_pixels, given, projected),
         alpha=np.where(alpha > NO_ANGLE, alpha, computed),
-        truncated=np.array([_share_outside(e, o) for e, o in zip(_extras(objects), outside)]),
-        occluded=_columns(labels, "occluded").astype(int),
+        truncated=np.array(
+            [_compute_truncation(e, o) for e, o in zip(_list_extras(objects), outside)]
+        ),
+        occluded=_read_columns(labels, "occluded").astype(int),
         scores=scores,
-        regions=given[np.array([label["class"] == "DontCare" for label in labels], bool)])
+        regions=given[np.array([label["class"] == "DontCare" for label in labels], bool)],
+    )
 
 
-def in_image(truth: GroundTruth, calibration: Calibration | None) -> GroundTruth:
+def select_in_image(truth: GroundTruth, calibration: Calibration | None) -> GroundTruth:
     """The labels of which a part is in the image; all without a calibration. KITTI has no others;
     who labels all around has."""
-    seen = np.flatnonzero(camera_objects(truth, calibration).pixels_high[:len(truth)] > 0)
+    seen = np.flatnonzero(to_camera_objects(truth, calibration).pixels_high[:len(truth)] > 0)
     return GroundTruth.of(truth.boxes[seen], truth.class_ids[seen],
                           [truth.extras[i] for i in seen], truth.notes)
 
 
-def _without_camera(objects: GroundTruth, scores: np.ndarray) -> CameraObjects:
+def _make_without_camera(objects: GroundTruth, scores: np.ndarray) -> CameraObjects:
     count = len(objects)
     return CameraObjects(
         objects.class_ids, objects.boxes, np.tile([-np.inf, -np.inf, np.inf, np.inf], (count, 1)),
@@ -125,16 +135,16 @@ def _without_camera(objects: GroundTruth, scores: np.ndarray) -> CameraObjects:
         np.zeros((0, 4)))
 
 
-def _extras(objects: GroundTruth) -> list[dict]:
+def _list_extras(objects: GroundTruth) -> list[dict]:
     return [*objects.extras, *(extra for _, extra in objects.notes)]
 
 
-def _share_outside(extra: dict, projected: float) -> float:
+def _compute_truncation(extra: dict, projected: float) -> float:
     if "track_id" not in extra and "truncated" in extra:
         return extra["truncated"]
-    return 1.0 if extra.get("truncated", 0) >= LEFT_OUT else projected
+    return 1.0 if extra.get("truncated", 0) >= IGNORED_LEVEL else projected
 
 
-def _columns(labels: list[dict], name: str, count: int = 0) -> np.ndarray:
+def _read_columns(labels: list[dict], name: str, count: int = 0) -> np.ndarray:
     values = np.array([label[name] for label in labels])
     return values.reshape(-1, count) if count else values

@@ -7,17 +7,19 @@ import numpy as np
 from lidar_perception.scoring.kitti.protocol import METRICS, RELAXED, ComparedFrame
 from lidar_perception.types import CLASSES
 
-GOOD_BEV = 20.0     # percent AP from above from which the score in space is looked at
-LOST_IN_SPACE = 4   # times lower in space than from above: heights are off
-SCATTER = 0.1       # metres of median error below which boxes are not too high or low as a whole
+MIN_BEV_AP = 20.0     # percent AP from above from which the score in space is looked at
+MIN_AP_RATIO = 4   # times lower in space than from above: heights are off
+MAX_MEDIAN_ERROR = (
+    0.1  # metres of median error below which boxes are not too high or low as a whole
+)
 
 
-def matched_heights(frames: list[ComparedFrame], name: str) -> dict:
+def measure_heights(frames: list[ComparedFrame], name: str) -> dict:
     """pairs: true objects of the class called name with the found box that overlaps them most from
     above (relaxed overlap). z_error_m, abs_z_error_m: median height of the found centre above the
     true one, and of its absolute value; height_error_m: median of found height minus true height;
     height_m: median true height. None without pairs."""
-    found, true = matched_boxes(frames, name)
+    found, true = match_boxes(frames, name)
     z, taller, height = found[:, 2] - true[:, 2], found[:, 5] - true[:, 5], true[:, 5]
     rows = {"z_error_m": z, "abs_z_error_m": np.abs(z), "height_error_m": taller,
             "height_m": height}
@@ -25,8 +27,8 @@ def matched_heights(frames: list[ComparedFrame], name: str) -> dict:
             **{key: float(np.median(v)) if len(z) else None for key, v in rows.items()}}
 
 
-def matched_boxes(frames: list[ComparedFrame], name: str,
-                  min_score: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
+def match_boxes(frames: list[ComparedFrame], name: str,
+                min_score: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
     """(P, 7) found boxes and the true ones of the class called name: for each true one the found
     one, of min_score or more, that overlaps it most from above, if beyond the relaxed overlap."""
     class_id, pairs = CLASSES.index(name), []
@@ -43,26 +45,26 @@ def matched_boxes(frames: list[ComparedFrame], name: str,
             np.concatenate([none, *(true for _, true in pairs)]))
 
 
-def heights_off(name: str, rows: dict, matched: dict) -> str:
+def diagnose_heights(name: str, rows: dict, matched: dict) -> str:
     """One line where the class called name is found from above but not in space, at the relaxed or
     the strict overlap; else ''. rows: its part of the report; matched: of matched_heights."""
     for suffix in ("_relaxed", ""):
         bev, space = (rows[metric + suffix]["moderate"] for metric in ("bev", "3d"))
-        if (matched["pairs"] and bev and bev["r40"] >= GOOD_BEV
-                and space["r40"] * LOST_IN_SPACE <= bev["r40"]):
+        if (matched["pairs"] and bev and bev["r40"] >= MIN_BEV_AP
+                and space["r40"] * MIN_AP_RATIO <= bev["r40"]):
             return (f"{name}: AP is {bev['r40']:.1f} from above but {space['r40']:.1f} in space "
                     f"(moderate, overlap {rows['bev' + suffix]['overlap']}): heights are off. "
-                    + _how_far_off(matched))
+                    + _describe_heights(matched))
     return ""
 
 
-def _how_far_off(matched: dict) -> str:
+def _describe_heights(matched: dict) -> str:
     z, taller, height = (matched[key] for key in ("z_error_m", "height_error_m", "height_m"))
     boxes = f"the {matched['pairs']} matched boxes are"
-    if abs(z) < SCATTER:
+    if abs(z) < MAX_MEDIAN_ERROR:
         return (f"By the median {boxes} {matched['abs_z_error_m']:.2f} m too high or too low, and "
                 f"{abs(taller):.2f} m too {'tall' if taller > 0 else 'flat'}.")
     reason = "check the height of the sensor, and the frame of the boxes."
-    if abs(abs(z) - height / 2) < SCATTER:
+    if abs(abs(z) - height / 2) < MAX_MEDIAN_ERROR:
         reason = "that is half their height: is z the bottom of a box and not its centre?"
     return f"By the median {boxes} {abs(z):.2f} m too {'high' if z > 0 else 'low'}; {reason}"

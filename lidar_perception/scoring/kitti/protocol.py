@@ -18,7 +18,11 @@ from numba import njit
 
 from lidar_perception.classes import DETECTED, TABLE
 from lidar_perception.geometry import bev_and_3d_iou
-from lidar_perception.scoring.average_precision import at_recall, averages, recall_thresholds
+from lidar_perception.scoring.average_precision import (
+    average_curve,
+    choose_thresholds,
+    sample_curve,
+)
 from lidar_perception.scoring.kitti.camera_objects import CameraObjects
 from lidar_perception.types import CLASSES
 
@@ -46,23 +50,23 @@ class ComparedFrame:
     excused: np.ndarray
 
 
-def compared(true: CameraObjects, found: CameraObjects) -> ComparedFrame:
+def compare_objects(true: CameraObjects, found: CameraObjects) -> ComparedFrame:
     """All overlaps of a frame. The order in which detections came makes no difference."""
     found = found.take(np.lexsort([*found.boxes.T, *found.image_boxes.T, -found.scores]))
-    shared = _shared_pixels(found.image_boxes, true.image_boxes)
-    own, others = _pixels(found.image_boxes), _pixels(true.image_boxes)
+    shared = _intersect(found.image_boxes, true.image_boxes)
+    own, others = _compute_areas(found.image_boxes), _compute_areas(true.image_boxes)
     with np.errstate(invalid="ignore", divide="ignore"):  # a box without pixels shares none
         image = np.nan_to_num(shared / (own[:, None] + others - shared))
-        excused = np.nan_to_num(_shared_pixels(found.image_boxes, true.regions) / own[:, None])
+        excused = np.nan_to_num(_intersect(found.image_boxes, true.regions) / own[:, None])
     overlaps = np.stack([image, *bev_and_3d_iou(found.boxes, true.boxes)])
     return ComparedFrame(true, found, overlaps, excused.max(axis=1, initial=0.0))
 
 
-def _pixels(boxes: np.ndarray) -> np.ndarray:
+def _compute_areas(boxes: np.ndarray) -> np.ndarray:
     return np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
 
 
-def _shared_pixels(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+def _intersect(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(K, M) area that 2D boxes (K, 4) and (M, 4) share."""
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
@@ -87,17 +91,17 @@ class Comparison:
         """At least one frame."""
         true, found = [f.true for f in frames], [f.found for f in frames]
         return Comparison(
-            CameraObjects.together(true), CameraObjects.together(found),
+            CameraObjects.concatenate(true), CameraObjects.concatenate(found),
             np.concatenate([f.overlaps.reshape(len(METRICS), -1) for f in frames], axis=1),
-            np.concatenate([f.excused for f in frames]), _starts(map(len, true)),
-            _starts(map(len, found)), _starts(f.overlaps[0].size for f in frames))
+            np.concatenate([f.excused for f in frames]), _find_starts(map(len, true)),
+            _find_starts(map(len, found)), _find_starts(f.overlaps[0].size for f in frames))
 
 
-def _starts(sizes) -> np.ndarray:
+def _find_starts(sizes) -> np.ndarray:
     return np.concatenate([[0], np.cumsum([*sizes])]).astype(np.int64)
 
 
-def true_states(objects: CameraObjects, name: str, difficulty: str) -> np.ndarray:
+def classify_labels(objects: CameraObjects, name: str, difficulty: str) -> np.ndarray:
     """(K,) int8 COUNTED, IGNORED or OTHER of labels, for the class called name."""
     level = DIFFICULTIES.index(difficulty)
     own = objects.class_ids == CLASSES.index(name)
@@ -108,7 +112,7 @@ def true_states(objects: CameraObjects, name: str, difficulty: str) -> np.ndarra
     return np.where(own & fit, COUNTED, np.where(own | like, IGNORED, OTHER)).astype(np.int8)
 
 
-def found_states(objects: CameraObjects, name: str, difficulty: str) -> np.ndarray:
+def classify_detections(objects: CameraObjects, name: str, difficulty: str) -> np.ndarray:
     """(K,) int8 COUNTED, IGNORED or OTHER of detections, for the class called name."""
     low = objects.pixels_high < MIN_PIXELS[DIFFICULTIES.index(difficulty)]
     own = objects.class_ids == CLASSES.index(name)
@@ -130,48 +134,58 @@ class Precision:
     official_r40: float
 
 
-def precision(frames: Comparison, name: str, metric: str, overlap: float,
-              difficulty: str) -> Precision | None:
+def compute_precision(frames: Comparison, name: str, metric: str, overlap: float,
+                      difficulty: str) -> Precision | None:
     """Average precision of the class called name at an overlap above the given one; None where
     there is nothing to find. Orientation is NaN where a hit has no angle."""
-    pairs = _pairs_of(frames, name, metric, overlap, difficulty)
+    pairs = _collect_pairs(frames, name, metric, overlap, difficulty)
     objects = int((pairs[2] == COUNTED).sum())
     if objects == 0:
         return None
-    thresholds = recall_thresholds(_hit_scores(*pairs), objects)
-    hits, wrong, turned = _counted(frames, pairs, metric, thresholds)
+    thresholds = choose_thresholds(_find_hit_scores(*pairs), objects)
+    hits, wrong, turned = _count(frames, pairs, metric, thresholds)
     right = hits / np.maximum(hits + wrong, 1)
     turned = turned / np.maximum(hits + wrong, 1)
-    return Precision(objects, *averages(at_recall(right, objects)),
-                     *averages(at_recall(turned, objects)),
-                     *averages(at_recall(right, objects, official=True)))
+    return Precision(objects, *average_curve(sample_curve(right, objects)),
+                     *average_curve(sample_curve(turned, objects)),
+                     *average_curve(sample_curve(right, objects, official=True)))
 
 
-def hits_and_wrong(frames: Comparison, name: str, metric: str, overlap: float, difficulty: str,
-                   thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def count_hits(frames: Comparison, name: str, metric: str, overlap: float, difficulty: str,
+               thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two (T,) float64: how many detections of a score of thresholds (T,) or more are right, and
     how many are wrong, by the rules of precision(); those that are ignored are neither."""
-    pairs = _pairs_of(frames, name, metric, overlap, difficulty)
-    return _counted(frames, pairs, metric, np.asarray(thresholds, np.float64))[:2]
+    pairs = _collect_pairs(frames, name, metric, overlap, difficulty)
+    return _count(frames, pairs, metric, np.asarray(thresholds, np.float64))[:2]
 
 
-def _pairs_of(frames: Comparison, name: str, metric: str, overlap: float, difficulty: str) -> tuple:
+def _collect_pairs(
+    frames: Comparison, name: str, metric: str, overlap: float, difficulty: str
+) -> tuple:
     """What _hit_scores takes."""
     return (frames.overlaps[METRICS.index(metric)], overlap,
-            true_states(frames.true, name, difficulty),
-            found_states(frames.found, name, difficulty),
+            classify_labels(frames.true, name, difficulty),
+            classify_detections(frames.found, name, difficulty),
             frames.found.scores, frames.first_true, frames.first_found, frames.first_pair)
 
 
-def _counted(frames: Comparison, pairs: tuple, metric: str, thresholds: np.ndarray) -> tuple:
+def _count(frames: Comparison, pairs: tuple, metric: str, thresholds: np.ndarray) -> tuple:
     """What _counts gives of pairs at thresholds (T,)."""
     excused = (frames.excused if metric == "image" else np.zeros(len(frames.found))) > pairs[1]
-    return _counts(*(*pairs, thresholds, excused, frames.true.alpha, frames.found.alpha))
+    return _count_hits(*(*pairs, thresholds, excused, frames.true.alpha, frames.found.alpha))
 
 
 @njit(cache=True, nogil=True)
-def _hit_scores(overlaps, least, true_states, found_states, scores, first_true, first_found,
-                first_pair):
+def _find_hit_scores(
+    overlaps,
+    least,
+    classify_labels,
+    classify_detections,
+    scores,
+    first_true,
+    first_found,
+    first_pair,
+):
     """Scores of the detections that find a counted object, when every object takes the best scored
     one that is left."""
     hits, number = np.empty(len(scores)), 0
@@ -179,25 +193,37 @@ def _hit_scores(overlaps, least, true_states, found_states, scores, first_true, 
     for f in range(len(first_pair) - 1):
         count = first_true[f + 1] - first_true[f]
         for i in range(first_true[f], first_true[f + 1]):
-            if true_states[i] == OTHER:
+            if classify_labels[i] == OTHER:
                 continue
             best = -1
             for j in range(first_found[f], first_found[f + 1]):
                 pair = first_pair[f] + (j - first_found[f]) * count + i - first_true[f]
-                if (found_states[j] != OTHER and not taken[j] and overlaps[pair] > least
+                if (classify_detections[j] != OTHER and not taken[j] and overlaps[pair] > least
                         and (best < 0 or scores[j] > scores[best])):
                     best = j
             if best >= 0:
                 taken[best] = True
-                if true_states[i] == COUNTED and found_states[best] == COUNTED:
+                if classify_labels[i] == COUNTED and classify_detections[best] == COUNTED:
                     hits[number] = scores[best]
                     number += 1
     return hits[:number]
 
 
 @njit(cache=True, nogil=True)
-def _counts(overlaps, least, true_states, found_states, scores, first_true, first_found, first_pair,
-            thresholds, excused, true_alpha, found_alpha):
+def _count_hits(
+    overlaps,
+    least,
+    classify_labels,
+    classify_detections,
+    scores,
+    first_true,
+    first_found,
+    first_pair,
+    thresholds,
+    excused,
+    true_alpha,
+    found_alpha,
+):
     """(T,) float64 each: hits, wrong detections and summed similarity of angle of the hits, among
     the detections that score each threshold or more, when every object takes the one of greatest
     overlap that is left; an ignored one only where there is no other."""
@@ -211,24 +237,24 @@ def _counts(overlaps, least, true_states, found_states, scores, first_true, firs
             while end < first_found[f + 1] and scores[end] >= thresholds[t]:
                 end += 1
             for i in range(first_true[f], first_true[f + 1]):
-                if true_states[i] == OTHER:
+                if classify_labels[i] == OTHER:
                     continue
                 best, most = -1, 0.0
                 for j in range(first_found[f], end):
                     overlap = overlaps[first_pair[f] + (j - first_found[f]) * count
                                        + i - first_true[f]]
-                    if found_states[j] == OTHER or taken[j] == t + 1 or not overlap > least:
+                    if classify_detections[j] == OTHER or taken[j] == t + 1 or not overlap > least:
                         continue
-                    if found_states[j] == COUNTED and overlap > most:
+                    if classify_detections[j] == COUNTED and overlap > most:
                         best, most = j, overlap
-                    elif found_states[j] == IGNORED and best < 0:
+                    elif classify_detections[j] == IGNORED and best < 0:
                         best = j
                 if best >= 0:
                     taken[best] = t + 1
-                    if true_states[i] == COUNTED and found_states[best] == COUNTED:
+                    if classify_labels[i] == COUNTED and classify_detections[best] == COUNTED:
                         hits[t] += 1
                         turned[t] += (1 + np.cos(true_alpha[i] - found_alpha[best])) / 2
             for j in range(first_found[f], end):
-                if found_states[j] == COUNTED and taken[j] != t + 1 and not excused[j]:
+                if classify_detections[j] == COUNTED and taken[j] != t + 1 and not excused[j]:
                     wrong[t] += 1
     return hits, wrong, turned

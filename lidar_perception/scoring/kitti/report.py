@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.scoring.centres.scores import CentreScores
-from lidar_perception.scoring.detections import Detected
-from lidar_perception.scoring.intervals import blocks, bounds, drawings
-from lidar_perception.scoring.kitti.camera_objects import camera_objects, scored_labels
-from lidar_perception.scoring.kitti.matched_heights import heights_off, matched_heights
+from lidar_perception.scoring.detections import FrameDetections
+from lidar_perception.scoring.intervals import compute_bounds, draw_samples, group_frames
+from lidar_perception.scoring.kitti.camera_objects import to_camera_objects, to_scored_labels
+from lidar_perception.scoring.kitti.matched_heights import diagnose_heights, measure_heights
 from lidar_perception.scoring.kitti.protocol import (
     DIFFICULTIES,
     RELAXED,
@@ -24,8 +24,8 @@ from lidar_perception.scoring.kitti.protocol import (
     ComparedFrame,
     Comparison,
     Precision,
-    compared,
-    precision,
+    compare_objects,
+    compute_precision,
 )
 from lidar_perception.types import PEDESTRIAN, Detections, InputError
 
@@ -49,7 +49,7 @@ class DetectionReport:
     with_camera: bool = True
     follow: bool = False
 
-    def update(self, result: Detected) -> None:
+    def update(self, result: FrameDetections) -> None:
         """One frame, as detections.py measures it.
 
         With a calibration, detections and labels outside the image are ignored, as KITTI's labels
@@ -64,12 +64,12 @@ class DetectionReport:
         truth, found, calibration = result.truth, result.detections, result.calibration
         if truth is None:
             return
-        found = scored_labels(found) if isinstance(found, Detections) else found
+        found = to_scored_labels(found) if isinstance(found, Detections) else found
         try:
-            true_objects, objects = (camera_objects(x, calibration) for x in (truth, found))
+            true_objects, objects = (to_camera_objects(x, calibration) for x in (truth, found))
         except InputError as error:
             raise InputError(f"{result.name}: {error}") from None
-        self.frames.append(compared(true_objects, objects))
+        self.frames.append(compare_objects(true_objects, objects))
         self.names.append(result.name)
         self.with_camera &= calibration is not None
         chosen = found.class_ids == PEDESTRIAN
@@ -85,11 +85,11 @@ class DetectionReport:
             "pedestrian_centres": self.pedestrians.compute(),
             "ms": float(np.median(self.ms)) if self.ms else None, "skipped": self.skipped}
         if self.frames:
-            together = Comparison.of(self.frames)
-            result["ap"] = {name: self._class_content(together, name) for name in SCORED}
-            result["map_3d"] = mean_3d(result["ap"])
-            result["matched"] = {name: matched_heights(self.frames, name) for name in SCORED}
-            result["diagnosis"] = [line for name in SCORED if (line := heights_off(
+            concatenate = Comparison.of(self.frames)
+            result["ap"] = {name: self._class_content(concatenate, name) for name in SCORED}
+            result["map_3d"] = average_3d(result["ap"])
+            result["matched"] = {name: measure_heights(self.frames, name) for name in SCORED}
+            result["diagnosis"] = [line for name in SCORED if (line := diagnose_heights(
                 name, result["ap"][name], result["matched"][name]))]
         return result
 
@@ -98,40 +98,42 @@ class DetectionReport:
         of the drives; see intervals.py. None without objects."""
         found: dict[tuple[str, str], list[float | None]] = {
             (name, row): [] for name in SCORED for row in INTERVALS}
-        for frames in drawings(blocks(self.names, self.follow), count):
-            together = Comparison.of([self.frames[i] for i in frames])
+        for frames in draw_samples(group_frames(self.names, self.follow), count):
+            concatenate = Comparison.of([self.frames[i] for i in frames])
             for (name, row), scores in found.items():
                 metric, overlaps = ROWS[row]
-                value = precision(together, name, metric, overlaps[name], "moderate")
+                value = compute_precision(concatenate, name, metric, overlaps[name], "moderate")
                 scores.append(None if value is None else value.r40)
-        return {name: {row: bounds(found[name, row]) for row in INTERVALS} for name in SCORED}
+        return {
+            name: {row: compute_bounds(found[name, row]) for row in INTERVALS} for name in SCORED
+        }
 
-    def _class_content(self, together: Comparison, name: str) -> dict:
-        rows = {row: {level: precision(together, name, metric, overlaps[name], level)
+    def _class_content(self, concatenate: Comparison, name: str) -> dict:
+        rows = {row: {level: compute_precision(concatenate, name, metric, overlaps[name], level)
                       for level in DIFFICULTIES}
                 for row, (metric, overlaps) in ROWS.items()
                 if self.with_camera or metric != "image"}
         content = {row: {"overlap": ROWS[row][1][name],
-                         **{level: _numbers(value) for level, value in levels.items()}}
+                         **{level: _to_content(value) for level, value in levels.items()}}
                    for row, levels in rows.items()}
         if "image" in rows:
-            content["aos"] = {level: _angle_numbers(value)
+            content["aos"] = {level: _to_angle_content(value)
                               for level, value in rows["image"].items()}
         return content
 
 
-def _numbers(value: Precision | None) -> dict | None:
+def _to_content(value: Precision | None) -> dict | None:
     return None if value is None else {
         "objects": value.objects, "r11": value.r11, "r40": value.r40,
         "official_r11": value.official_r11, "official_r40": value.official_r40}
 
 
-def _angle_numbers(value: Precision | None) -> dict | None:
+def _to_angle_content(value: Precision | None) -> dict | None:
     return None if value is None or math.isnan(value.aos_r40) else {
         "objects": value.objects, "r11": value.aos_r11, "r40": value.aos_r40}
 
 
-def mean_3d(ap: dict) -> dict | None:
+def average_3d(ap: dict) -> dict | None:
     """r11 and r40: means of 3D AP over the classes and difficulties with objects, as the mAP of
     the EG-PointPillars paper; None without objects."""
     rows = [row for name in SCORED for level in DIFFICULTIES if (row := ap[name]["3d"][level])]

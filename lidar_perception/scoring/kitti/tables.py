@@ -5,16 +5,16 @@ from __future__ import annotations
 from rich.console import Console
 
 from lidar_perception.classes import CAR, CLASSES, CYCLIST, PEDESTRIAN
-from lidar_perception.scoring.average_precision import FEW
-from lidar_perception.scoring.intervals import SHARE
+from lidar_perception.scoring.average_precision import MIN_OBJECTS
+from lidar_perception.scoring.intervals import INTERVAL_PERCENT
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES
 from lidar_perception.scoring.kitti.report import INTERVALS
 from lidar_perception.scoring.tables import (
-    between,
-    counts,
-    narrow_table,
-    number,
-    percent,
+    format_counts,
+    format_interval,
+    format_number,
+    format_percent,
+    make_table,
     print_skipped,
     print_time,
 )
@@ -49,18 +49,25 @@ def print_detection_report(content: dict, console: Console) -> None:
 
 
 def _print_precision(content: dict, console: Console) -> None:
-    table = narrow_table(f"KITTI average precision, {content['frames']} frames", "", "overlap",
-                         "", "R40", "", "", "R11", "", width=6)
+    table = make_table(f"KITTI average precision, {content['frames']} frames", "", "overlap",
+                       "", "R40", "", "", "R11", "", width=6)
     table.add_row("", "", *("easy", "mod.", "hard") * 2, style="dim")
     for name, rows in content["ap"].items():
-        objects = [level["objects"] if level else 0 for level in _levels(rows["3d"])]
-        table.add_row(name, "", *(f"{n}{'*' * (0 < n < FEW)}" for n in objects), "", "", "",
+        objects = [level["objects"] if level else 0 for level in _list_levels(rows["3d"])]
+        table.add_row(name, "", *(f"{n}{'*' * (0 < n < MIN_OBJECTS)}" for n in objects), "", "", "",
                       style="bold")
         for row, title in TITLES.items():
             if row in rows:
                 overlap = rows["image" if row == "aos" else row]["overlap"]
-                table.add_row(f"  {title}", f"{overlap:g}", *(
-                    _cell(level, key) for key in ("r40", "r11") for level in _levels(rows[row])))
+                table.add_row(
+                    f"  {title}",
+                    f"{overlap:g}",
+                    *(
+                        _format_cell(level, key)
+                        for key in ("r40", "r11")
+                        for level in _list_levels(rows[row])
+                    ),
+                )
         table.add_section()
     table.caption = ("Beside the class: labels of each difficulty. * too few for KITTI's own "
                      "sampling of recall, so read off the whole curve.")
@@ -69,13 +76,13 @@ def _print_precision(content: dict, console: Console) -> None:
 
 def _print_paper(content: dict, console: Console) -> None:
     titles = [f"{name[:3]} {level[0].upper()}" for name in COLUMNS for level in DIFFICULTIES]
-    table = narrow_table("AP in space beside Table 5 of the EG-PointPillars paper", "", *titles,
-                         "mAP", width=5)
+    table = make_table("AP in space beside Table 5 of the EG-PointPillars paper", "", *titles,
+                       "mAP", width=5)
     for key in ("r40", "r11"):
-        cells = [_cell(level, key) for name in COLUMNS
-                 for level in _levels(content["ap"][name]["3d"])]
+        cells = [_format_cell(level, key) for name in COLUMNS
+                 for level in _list_levels(content["ap"][name]["3d"])]
         mean = content["map_3d"]
-        table.add_row(f"here, {key.upper()}", *cells, number(mean[key] if mean else None),
+        table.add_row(f"here, {key.upper()}", *cells, format_number(mean[key] if mean else None),
                       style="bold")
     for name, classes in PAPER.items():
         table.add_row(name, *(f"{v:.2f}" for levels in classes for v in levels),
@@ -87,34 +94,34 @@ def _print_paper(content: dict, console: Console) -> None:
 
 def print_intervals(content: dict[str, dict], console: Console) -> None:
     """Of AP, as DetectionReport.intervals gives them."""
-    table = narrow_table(f"{SHARE} % intervals of AP (R40, moderate), drawn by drive", "",
-                         *(TITLES[row] + overlap for row, overlap in zip(
+    table = make_table(f"{INTERVAL_PERCENT} % intervals of AP (R40, moderate), drawn by drive", "",
+                       *(TITLES[row] + overlap for row, overlap in zip(
                              INTERVALS, (", relaxed", "", ""))), width=10)
     for name, rows in content.items():
-        table.add_row(name, *(between(rows[row]) for row in INTERVALS))
+        table.add_row(name, *(format_interval(rows[row]) for row in INTERVALS))
     console.print(table)
 
 
 def _print_centres(centres: dict, console: Console) -> None:
     if centres["ground_truth"] == 0:
         return
-    table = narrow_table(
+    table = make_table(
         f"Pedestrians within 1.0 m: {centres['ground_truth']} in {centres['frames']} frames",
         "detections", "TP", "FP", "FN", "prec.", "recall", "F1", width=7)
     rows = {"all": centres["of_all"]["all"]}
     if centres["best_score"] is not None:
         rows[f"score {centres['best_score']:.3g} and more"] = centres["at_best_score"]["all"]
     for title, row in rows.items():
-        table.add_row(title, *counts(row, "tp", "fp", "fn"),
-                      *percent(row, "precision", "recall", "f1"))
+        table.add_row(title, *format_counts(row, "tp", "fp", "fn"),
+                      *format_percent(row, "precision", "recall", "f1"))
     table.caption = "F1 in the STM-CPA paper: " + ", ".join(
         f"{name} {100 * f1:.1f}" for name, f1 in CENTRE_F1.items())
     console.print(table)
 
 
-def _levels(row: dict) -> list[dict | None]:
+def _list_levels(row: dict) -> list[dict | None]:
     return [row[level] for level in DIFFICULTIES]
 
 
-def _cell(level: dict | None, key: str) -> str:
-    return number(None if level is None else level[key])
+def _format_cell(level: dict | None, key: str) -> str:
+    return format_number(None if level is None else level[key])

@@ -26,25 +26,25 @@ RANGES = {"car": 50.0, "truck": 50.0, "bus": 50.0, "trailer": 50.0, "constructio
 DISTANCES = (0.5, 1.0, 2.0, 4.0)    # metres between centres, below which a detection is a hit
 ERROR_DISTANCE = 2.0                # of the hits whose errors are taken
 RECALLS = np.linspace(0.0, 1.0, 101)
-FIRST_RECALL = 11                   # the first of RECALLS above the least recall of 0.1
+FIRST_RECALL_INDEX = 11                   # the first of RECALLS above the least recall of 0.1
 MIN_PRECISION = 0.1
-AP_WEIGHT = 5                       # of mAP in NDS, beside one for each of ERRORS
-IN_RACKS = ("bicycle", "motorcycle")  # not counted inside a bicycle rack
+MAP_WEIGHT = 5                       # of mAP in NDS, beside one for each of ERRORS
+RACK_CLASSES = ("bicycle", "motorcycle")  # not counted inside a bicycle rack
 
 # translation m, scale 1 - IoU of the aligned boxes, orientation rad, velocity m/s, attribute
 # 1 - accuracy
 ERRORS = ("ate", "ase", "aoe", "ave", "aae")
 UNDEFINED = {"traffic_cone": ("aoe", "ave", "aae"), "barrier": ("ave", "aae")}
-HALF_TURNS = ("barrier",)           # look the same from both sides
+SYMMETRIC_CLASSES = ("barrier",)           # look the same from both sides
 
 
-def counted(boxes: GlobalBoxes, ego: np.ndarray, racks: GlobalBoxes) -> np.ndarray:
+def select_counted(boxes: GlobalBoxes, ego: np.ndarray, racks: GlobalBoxes) -> np.ndarray:
     """(K,) bool of the labels or detections of one frame: those of a class, within its range of the
     vehicle at ego (>=2,), not known to be without points, and no bicycle in a rack."""
     ranges = np.array([RANGES[name] for name in NAMES] + [0.0])[boxes.class_ids]  # -1 is the last
     away = np.sqrt(((boxes.centres[:, :2] - ego[:2]) ** 2).sum(axis=1))
     kept = (away < ranges) & (boxes.points != 0)
-    cycles = np.isin(boxes.class_ids, [NAMES.index(name) for name in IN_RACKS])
+    cycles = np.isin(boxes.class_ids, [NAMES.index(name) for name in RACK_CLASSES])
     for rack in np.column_stack([racks.centres, racks.sizes, racks.yaws]):
         kept &= ~(cycles & points_in_box(boxes.centres, rack))
     return kept
@@ -66,8 +66,8 @@ class ClassScores:
         return float(np.mean([*self.ap.values()]))
 
 
-def class_scores(name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: GlobalBoxes,
-                 found_frames: np.ndarray) -> ClassScores:
+def score_class(name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: GlobalBoxes,
+                found_frames: np.ndarray) -> ClassScores:
     """Scores of the class called name, over counted boxes of all frames: truth (M) and found (K),
     with the numbers of their frames (M,), ascending, and (K,), int."""
     own, own_found = (boxes.class_ids == NAMES.index(name) for boxes in (truth, found))
@@ -79,20 +79,24 @@ def class_scores(name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: 
     first = np.searchsorted(true_frames, np.arange(frames + 1))
     ap, errors = {}, {}
     for distance in DISTANCES:
-        indices = _hits(found.centres, found_frames, truth.centres, first, distance)
-        precision, confidence = _curves(indices >= 0, found.scores, len(truth))
-        above = np.maximum(precision[FIRST_RECALL:] - MIN_PRECISION, 0)
+        indices = _match(found.centres, found_frames, truth.centres, first, distance)
+        precision, confidence = _interpolate_curves(indices >= 0, found.scores, len(truth))
+        above = np.maximum(precision[FIRST_RECALL_INDEX:] - MIN_PRECISION, 0)
         ap[distance] = float(above.mean()) / (1 - MIN_PRECISION)
         if distance == ERROR_DISTANCE:
             hits = found[indices >= 0]
-            errors = {error: _at_recalls(values, hits.scores, confidence) for error, values in
-                      hit_errors(truth[indices[indices >= 0]], hits, name in HALF_TURNS).items()}
+            errors = {
+                error: _average_error(values, hits.scores, confidence)
+                for error, values in compute_errors(
+                    truth[indices[indices >= 0]], hits, name in SYMMETRIC_CLASSES
+                ).items()
+            }
     errors |= dict.fromkeys(UNDEFINED.get(name, ()), math.nan)
     return ClassScores(len(truth), len(found), ap, errors)
 
 
 @njit(cache=True, nogil=True)
-def _hits(centres, frames, true_centres, first, most):
+def _match(centres, frames, true_centres, first, most):
     """(K,) int64 row of the object that each detection hits, -1 without one; detections by falling
     score, objects of frame f in rows first[f] .. first[f + 1]."""
     indices, taken = np.full(len(centres), -1), np.zeros(len(true_centres), np.bool_)
@@ -108,7 +112,9 @@ def _hits(centres, frames, true_centres, first, most):
     return indices
 
 
-def _curves(hit: np.ndarray, scores: np.ndarray, objects: int) -> tuple[np.ndarray, np.ndarray]:
+def _interpolate_curves(
+    hit: np.ndarray, scores: np.ndarray, objects: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Precision and score (101,) at RECALLS, read off between the detections (K,), which come by
     falling score; 0 at a recall that is not reached."""
     if not hit.any():
@@ -120,20 +126,22 @@ def _curves(hit: np.ndarray, scores: np.ndarray, objects: int) -> tuple[np.ndarr
             np.interp(RECALLS, recall, scores, right=0))
 
 
-def _at_recalls(values: np.ndarray, scores: np.ndarray, confidence: np.ndarray) -> float:
+def _average_error(values: np.ndarray, scores: np.ndarray, confidence: np.ndarray) -> float:
     """Mean of an error over the recalls that are reached, from FIRST_RECALL on, where at each the
     error is the mean of all hits (H,) up to it; NaN are left out, and 1 is where all are."""
     reached = np.flatnonzero(confidence)
     last = reached[-1] if len(reached) else 0
-    if last < FIRST_RECALL or np.isnan(values).all():
+    if last < FIRST_RECALL_INDEX or np.isnan(values).all():
         return 1.0
     known = np.cumsum(~np.isnan(values))
     so_far = np.nancumsum(values) / np.maximum(known, 1)
     curve = np.interp(confidence[::-1], scores[::-1], so_far[::-1])[::-1]
-    return float(curve[FIRST_RECALL:last + 1].mean())
+    return float(curve[FIRST_RECALL_INDEX:last + 1].mean())
 
 
-def hit_errors(truth: GlobalBoxes, found: GlobalBoxes, half_turns: bool) -> dict[str, np.ndarray]:
+def compute_errors(
+    truth: GlobalBoxes, found: GlobalBoxes, half_turns: bool
+) -> dict[str, np.ndarray]:
     """The ERRORS (H,) float64 of pairs of boxes, NaN where the true velocity or attribute, or the
     velocity found, is not known. With half_turns a box that is turned by pi is the same."""
     shared = np.minimum(truth.sizes, found.sizes).prod(axis=1)
@@ -146,12 +154,12 @@ def hit_errors(truth: GlobalBoxes, found: GlobalBoxes, half_turns: bool) -> dict
             "aae": np.where(truth.attributes < 0, np.nan, differs)}
 
 
-def summary(scores: dict[str, ClassScores]) -> dict[str, float]:
+def summarize(scores: dict[str, ClassScores]) -> dict[str, float]:
     """map, the mean of each of ERRORS over the classes that have it, and nds, nuScenes' detection
     score: the mean of mAP, five times, and of 1 - error, at least 0, for each error. 0..1."""
     result = {"map": float(np.mean([s.mean_ap for s in scores.values()]))}
     for error in ERRORS:
         result[error] = float(np.nanmean([s.errors[error] for s in scores.values()]))
     parts = [max(0.0, 1.0 - result[error]) for error in ERRORS]
-    result["nds"] = (AP_WEIGHT * result["map"] + sum(parts)) / (AP_WEIGHT + len(parts))
+    result["nds"] = (MAP_WEIGHT * result["map"] + sum(parts)) / (MAP_WEIGHT + len(parts))
     return result

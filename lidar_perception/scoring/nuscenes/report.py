@@ -14,11 +14,16 @@ from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.nuscenes.boxes import NAMES, GlobalBoxes
 from lidar_perception.data.nuscenes.results import NAME_BY_CLASS, read_results, to_results
 from lidar_perception.detectors.contract import Detector
-from lidar_perception.scoring.detections import detected
-from lidar_perception.scoring.nuscenes.protocol import ClassScores, class_scores, counted, summary
+from lidar_perception.scoring.detections import run_detector
+from lidar_perception.scoring.nuscenes.protocol import (
+    ClassScores,
+    score_class,
+    select_counted,
+    summarize,
+)
 from lidar_perception.types import InputError
 
-OURS = tuple(NAME_BY_CLASS.values())
+DETECTED_NAMES = tuple(NAME_BY_CLASS.values())
 
 
 @dataclass(frozen=True)
@@ -34,20 +39,26 @@ class KeyFrameResult:
     problem: str | None = None
 
 
-def key_frame(frame: Frame, boxes: GlobalBoxes, ms: float | None = None,
-              problem: str | None = None) -> KeyFrameResult:
+def select_boxes(frame: Frame, boxes: GlobalBoxes, ms: float | None = None,
+                 problem: str | None = None) -> KeyFrameResult:
     """What counts of the boxes and of the labels of a frame of nuScenes."""
     key = frame.native
     labels = key.labels()
     if labels is None:
         return KeyFrameResult(key.token, boxes, None, None, ms, problem)
     racks = labels.bicycle_racks()
-    return KeyFrameResult(key.token, boxes, labels.boxes[counted(labels.boxes, key.ego, racks)],
-                          boxes[counted(boxes, key.ego, racks)], ms, problem)
+    return KeyFrameResult(
+        key.token,
+        boxes,
+        labels.boxes[select_counted(labels.boxes, key.ego, racks)],
+        boxes[select_counted(boxes, key.ego, racks)],
+        ms,
+        problem,
+    )
 
 
-def by_detector(open_: Callable[[], Detector], unlabelled: bool,
-                recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
+def measure_key_frames(open_: Callable[[], Detector], unlabelled: bool,
+                       recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
     """Runs the detector that open_() gives on every key frame with labels, with unlabelled on
     all. All but the recording given, a Start of scoring.run."""
     detector = open_()
@@ -55,22 +66,24 @@ def by_detector(open_: Callable[[], Detector], unlabelled: bool,
     def measure(frame: Frame) -> KeyFrameResult | None:
         if frame.native.labels() is None and not unlabelled:
             return None
-        result = detected(detector, frame, None, None)
+        result = run_detector(detector, frame, None, None)
         boxes, problem = GlobalBoxes.none(), result.problem
         try:
             boxes = to_results(result.detections, frame)
         except InputError as error:
             problem = str(error)
-        return key_frame(frame, boxes, result.ms,
-                         None if problem is None else f"{frame.name}: {problem}")
+        return select_boxes(frame, boxes, result.ms,
+                            None if problem is None else f"{frame.name}: {problem}")
     return measure
 
 
-def by_file(path: Path, recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
+def measure_result_file(
+    path: Path, recording: Recording
+) -> Callable[[Frame], KeyFrameResult | None]:
     """Reads a result file of nuScenes' detection task. With a path a Start of scoring.run."""
     boxes = read_results(path, list(recording))
     return lambda frame: (None if frame.native.labels() is None
-                          else key_frame(frame, boxes[frame.name]))
+                          else select_boxes(frame, boxes[frame.name]))
 
 
 @dataclass
@@ -109,21 +122,21 @@ class NuscenesReport:
                             for parts in (self.truth, self.detections))
             numbers = [np.repeat(np.arange(self.frames), [len(part) for part in parts])
                        for parts in (self.truth, self.detections)]
-            scores = {name: class_scores(name, truth, numbers[0], found, numbers[1])
+            scores = {name: score_class(name, truth, numbers[0], found, numbers[1])
                       for name in NAMES}
-            result["classes"] = {name: _class_content(s) for name, s in scores.items()}
-            result["all"] = _percent(summary(scores))
-            result["ours"] = _percent(summary({name: scores[name] for name in OURS}))
+            result["classes"] = {name: _to_class_content(s) for name, s in scores.items()}
+            result["all"] = _to_percent(summarize(scores))
+            result["ours"] = _to_percent(summarize({name: scores[name] for name in DETECTED_NAMES}))
         return result
 
 
-def _class_content(scores: ClassScores) -> dict:
+def _to_class_content(scores: ClassScores) -> dict:
     return {"objects": scores.objects, "detections": scores.detections,
             "ap": {f"{distance:g}": 100 * ap for distance, ap in scores.ap.items()},
             "mean_ap": 100 * scores.mean_ap,
             **{name: None if math.isnan(error) else error for name, error in scores.errors.items()}}
 
 
-def _percent(figures: dict[str, float]) -> dict[str, float]:
+def _to_percent(figures: dict[str, float]) -> dict[str, float]:
     return {name: 100 * value if name in ("map", "nds") else value
             for name, value in figures.items()}

@@ -5,8 +5,8 @@ from __future__ import annotations
 from rich.console import Console
 
 from lidar_perception.scoring.nuscenes.protocol import DISTANCES, ERRORS
-from lidar_perception.scoring.nuscenes.report import OURS
-from lidar_perception.scoring.tables import narrow_table, number, print_skipped, print_time
+from lidar_perception.scoring.nuscenes.report import DETECTED_NAMES
+from lidar_perception.scoring.tables import format_number, make_table, print_skipped, print_time
 
 # The improved-PointNet paper on nuScenes. It names neither the split nor the classes, and gives no
 # AOE, AVE and AAE.
@@ -15,17 +15,22 @@ PAPER = {"map": 92.68, "ate": 0.298, "ase": 0.218, "nds": 83.45}
 
 def print_nuscenes_report(content: dict, console: Console) -> None:
     """AP at each distance and the errors, by class and over all, and what was left out."""
-    table = narrow_table(f"nuScenes detection, {content['frames']} frames", "", "labels",
-                         *(f"{d:g}m" for d in DISTANCES), "mAP", *(e.upper() for e in ERRORS),
-                         "NDS", width=4)
+    table = make_table(f"nuScenes detection, {content['frames']} frames", "", "labels",
+                       *(f"{d:g}m" for d in DISTANCES), "mAP", *(e.upper() for e in ERRORS),
+                       "NDS", width=4)
     for name, row in content["classes"].items():
-        table.add_row(name.replace("construction_vehicle", "constr. veh.").replace("_", " "),
-                      str(row["objects"]), *(f"{ap:.3g}" for ap in row["ap"].values()),
-                      number(row["mean_ap"]), *_errors(row), style="" if name in OURS else "dim")
+        table.add_row(
+            name.replace("construction_vehicle", "constr. veh.").replace("_", " "),
+            str(row["objects"]),
+            *(f"{ap:.3g}" for ap in row["ap"].values()),
+            format_number(row["mean_ap"]),
+            *_errors(row),
+            style="" if name in DETECTED_NAMES else "dim",
+        )
     table.add_section()
     for key, title in ("all", "all ten"), ("ours", "our three"):
         objects = sum(row["objects"] for name, row in content["classes"].items()
-                      if key == "all" or name in OURS)
+                      if key == "all" or name in DETECTED_NAMES)
         table.add_row(title, str(objects), *[""] * len(DISTANCES), *_means(content[key]),
                       style="bold")
     table.add_row("the paper", "", *[""] * len(DISTANCES), *_means(PAPER), style="dim")
@@ -40,8 +45,8 @@ def print_nuscenes_report(content: dict, console: Console) -> None:
 
 
 def _means(row: dict) -> list[str]:
-    return [number(row["map"]), *_errors(row), number(row["nds"])]
+    return [format_number(row["map"]), *_errors(row), format_number(row["nds"])]
 
 
 def _errors(row: dict) -> list[str]:
-    return [number(row.get(name), width=4) for name in ERRORS]
+    return [format_number(row.get(name), width=4) for name in ERRORS]

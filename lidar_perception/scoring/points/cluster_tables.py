@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.console import Console
 
-from lidar_perception.scoring.tables import narrow_table, number, print_skipped
+from lidar_perception.scoring.tables import format_number, make_table, print_skipped
 
 # Paper C: segmentation on KITTI, in percent
 PAPER = {"accuracy": 94.96, "precision": 94.3, "recall": 93.5, "f1": 93.9, "iou": 92.12}
@@ -16,29 +16,36 @@ def print_cluster_scores(content: dict[str, Any], out: Console) -> None:
     """The confusion of clusters, and the paper's figures."""
     names = content["classes"]
     rows = content["clusters"]
-    table = narrow_table(f"Clusters of {content['min_points']} points or more, "
-                         f"{content['frames']} frames", "is \\ found", *names, "recall", "prec.")
+    table = make_table(f"Clusters of {content['min_points']} points or more, "
+                       f"{content['frames']} frames", "is \\ found", *names, "recall", "prec.")
     for name, counts in zip(names, rows["confusion"]):
         row = rows["by_class"].get(name, {})
-        table.add_row(name, *map(str, counts), _number(row.get("recall")),
-                      _number(row.get("precision")))
-    table.caption = (f"{_number(rows['accuracy'])} % of the clusters are of the class that the "
-                     f"network says, {_number(rows['object_accuracy'])} % of the objects among "
-                     "them.")
+        table.add_row(name, *map(str, counts), _format_number(row.get("recall")),
+                      _format_number(row.get("precision")))
+    table.caption = (
+        f"{_format_number(rows['accuracy'])} % of the clusters are of the class that the "
+        f"network says, {_format_number(rows['object_accuracy'])} % of the objects among "
+        "them."
+    )
     out.print(table)
-    table = narrow_table("Points in the image, in percent", "", "accuracy", "precision", "recall",
-                         "F1", "IoU")
+    table = make_table("Points in the image, in percent", "", "accuracy", "precision", "recall",
+                       "F1", "IoU")
     points = content["points"]
-    table.add_row("mean of the classes", _number(points["accuracy"]),
-                  *(_number(points["mean"][key]) for key in ("precision", "recall", "f1", "iou")))
+    table.add_row(
+        "mean of the classes",
+        _format_number(points["accuracy"]),
+        *(_format_number(points["mean"][key]) for key in ("precision", "recall", "f1", "iou")),
+    )
     for name, row in points["by_class"].items():
-        table.add_row(f"  {name}", "", *(_number(row[key]) for key in
+        table.add_row(f"  {name}", "", *(_format_number(row[key]) for key in
                                          ("precision", "recall", "f1", "iou")))
-    table.add_row("its paper, KITTI", *(_number(value) for value in PAPER.values()), style="dim")
+    table.add_row(
+        "its paper, KITTI", *(_format_number(value) for value in PAPER.values()), style="dim"
+    )
     table.caption = "The paper does not say how it counts points."
     out.print(table)
     print_skipped(content["skipped"], out)
 
 
-def _number(value: float | None) -> str:
-    return number(value, digits=1)
+def _format_number(value: float | None) -> str:
+    return format_number(value, digits=1)

@@ -25,17 +25,22 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, GroundTruth
 
 UNKNOWN = -1              # a label of which nothing is said
-SURE, UNSURE = 0.5, 0.15  # a cluster with this share of its points in a box is that object, with
-                          # less than the second it is background
-BORDER = 0.05             # m: points so near to a box are taken for its own, as labels are rounded
+MIN_OBJECT_SHARE, MAX_BACKGROUND_SHARE = (
+    0.5,
+    0.15,
+)  # a cluster with this share of its points in a box is that object, with
+# less than the second it is background
+BOX_MARGIN = 0.05  # m: points so near to a box are taken for its own, as labels are rounded
 # These look like a class, and are none of it; or nobody knows what they are.
-NEITHER = [row.name for row in TABLE if row.numbers is None and (row.looks_like or row.vehicle)]
-NEITHER.append(CLASSES[DONT_CARE])
+IGNORED_CLASSES = [
+    row.name for row in TABLE if row.numbers is None and (row.looks_like or row.vehicle)
+]
+IGNORED_CLASSES.append(CLASSES[DONT_CARE])
 MIN_POINTS = 10         # clusters with fewer do not count
 
 
-def labelled(clusters: Clusters, boxes: np.ndarray, class_ids: np.ndarray,
-             classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+def label_clusters(clusters: Clusters, boxes: np.ndarray, class_ids: np.ndarray,
+                   classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """labels (K,) int64 of clusters into classes, their number for background, UNKNOWN for what is
     neither; owners (K,) int64: which of boxes (M, 7), of class_ids (M,) into CLASSES, each is of,
     -1 for none. Of several boxes the one with most of its points counts."""
@@ -44,53 +49,55 @@ def labelled(clusters: Clusters, boxes: np.ndarray, class_ids: np.ndarray,
     share, owners = np.zeros(count), np.full(count, -1)
     sizes = np.maximum(clusters.sizes, 1)
     for i, box in enumerate(boxes):
-        inside = points_in_box(clusters.points[:, :3], box, BORDER)
+        inside = points_in_box(clusters.points[:, :3], box, BOX_MARGIN)
         part = np.bincount(number[inside], minlength=count) / sizes
         more = part > share
         share[more], owners[more] = part[more], i
-    of_boxes = np.append(labels_of(class_ids, classes), background)
-    labels = np.where(share >= SURE, of_boxes[owners], UNKNOWN)
-    labels[share < UNSURE] = background
+    of_boxes = np.append(map_labels(class_ids, classes), background)
+    labels = np.where(share >= MIN_OBJECT_SHARE, of_boxes[owners], UNKNOWN)
+    labels[share < MAX_BACKGROUND_SHARE] = background
     owners[(labels == UNKNOWN) | (labels == background)] = -1
     return labels, owners
 
 
-def point_labels(xyz: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray,
+def label_points(xyz: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray,
                  classes: Sequence[str]) -> np.ndarray:
     """(N,) int64 of points (N, 3): the class whose box they are in, else their number for
     background; UNKNOWN for those in a box that is neither."""
     labels = np.full(len(xyz), len(classes))
-    for label, box in zip(labels_of(class_ids, classes), boxes):
-        labels[points_in_box(xyz, box, BORDER)] = label
+    for label, box in zip(map_labels(class_ids, classes), boxes):
+        labels[points_in_box(xyz, box, BOX_MARGIN)] = label
     return labels
 
 
-def uncared(truth: GroundTruth, camera: Camera, xyz: np.ndarray) -> np.ndarray:
+def find_unlabelled(truth: GroundTruth, camera: Camera, xyz: np.ndarray) -> np.ndarray:
     """(N,) bool: points (N, 3) in regions of the image where nothing is labelled (DontCare)."""
     regions = [extra["bbox"] for name, extra in truth.notes if name == "DontCare"]
     return camera.in_regions(xyz, np.array(regions, float))
 
 
-def unknown_where(labels: np.ndarray, clusters: Clusters, uncared: np.ndarray,
-                  background: int) -> np.ndarray:
+def mask_unlabelled(labels: np.ndarray, clusters: Clusters, unlabelled: np.ndarray,
+                    background: int) -> np.ndarray:
     """labels (K,) of clusters with UNKNOWN for background of which half of the points or more are
     not cared for, uncared (P,) bool."""
     number = np.repeat(np.arange(len(clusters)), clusters.sizes)
-    share = np.bincount(number, uncared, minlength=len(clusters)) / np.maximum(clusters.sizes, 1)
+    share = np.bincount(number, unlabelled, minlength=len(clusters)) / np.maximum(
+        clusters.sizes, 1
+    )
     return np.where((labels == background) & (share >= 0.5), UNKNOWN, labels)
 
 
-def labels_of(class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
+def map_labels(class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
     """(M,) int64 into classes of class_ids (M,) into CLASSES; their number for what is background,
     UNKNOWN for what looks like a class and is none."""
     return np.array([classes.index(name) if name in classes else
-                     UNKNOWN if name in NEITHER else len(classes)
+                     UNKNOWN if name in IGNORED_CLASSES else len(classes)
                      for name in (CLASSES[i] for i in class_ids)], np.int64)
 
 
-def confusions(clusters: Clusters, labels: np.ndarray, predictions: Predictions,
-               point_truth: np.ndarray, cluster_ids: np.ndarray,
-               classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+def count_confusions(clusters: Clusters, labels: np.ndarray, predictions: Predictions,
+                     point_truth: np.ndarray, cluster_ids: np.ndarray,
+                     classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Counts (K + 1, K + 1) by true and by predicted class, background last, of one frame's
     clusters with labels and what the network says of them, and of all N points with their labels
     and the numbers of their clusters, 0 for none."""
@@ -107,8 +114,8 @@ def confusions(clusters: Clusters, labels: np.ndarray, predictions: Predictions,
     return of_clusters, of_points
 
 
-def by_network(weights: Path, settings: Mapping[str, Any],
-               recording: Recording) -> Callable[[Frame], Any]:
+def measure_network(weights: Path, settings: Mapping[str, Any],
+                    recording: Recording) -> Callable[[Frame], Any]:
     """Run a cluster network on every frame with labelled boxes, on its points in the image. With
     the first arguments a Start of scoring.run.
 
@@ -131,15 +138,17 @@ def by_network(weights: Path, settings: Mapping[str, Any],
         if camera is None:  # then all around is labelled
             indices, hidden = np.arange(len(scan)), lambda xyz: np.zeros(len(xyz), bool)
         else:
-            indices, hidden = np.flatnonzero(camera.in_view(scan.xyz)), partial(uncared, truth,
-                                                                               camera)
+            indices, hidden = (
+                np.flatnonzero(camera.in_view(scan.xyz)),
+                partial(find_unlabelled, truth, camera),
+            )
         seen, ids = scan.take(indices), ids[indices]
         made = clusters_of(seen, ids, ground=ground[indices])
-        labels, _ = labelled(made, truth.boxes, truth.class_ids, config.classes)
-        labels = unknown_where(labels, made, hidden(made.points[:, :3]), background)
-        points = point_labels(seen.xyz, truth.boxes, truth.class_ids, config.classes)
+        labels, _ = label_clusters(made, truth.boxes, truth.class_ids, config.classes)
+        labels = mask_unlabelled(labels, made, hidden(made.points[:, :3]), background)
+        points = label_points(seen.xyz, truth.boxes, truth.class_ids, config.classes)
         points[(points == background) & hidden(seen.xyz)] = UNKNOWN
-        return confusions(made, labels, classifier.predict(made), points, ids, config.classes)
+        return count_confusions(made, labels, classifier.predict(made), points, ids, config.classes)
     return measure
 
 
@@ -167,28 +176,28 @@ class ClusterScores:
     def compute(self) -> dict[str, Any]:
         """As JSON; shares in percent, None without objects."""
         return {"frames": self.frames, "classes": [*self.classes, "background"],
-                "min_points": MIN_POINTS, "clusters": _scores(self.clusters, self.classes),
-                "points": _scores(self.points, self.classes), "skipped": self.skipped}
+                "min_points": MIN_POINTS, "clusters": _compute_scores(self.clusters, self.classes),
+                "points": _compute_scores(self.points, self.classes), "skipped": self.skipped}
 
 
-def _scores(confusion: np.ndarray, classes: Sequence[str]) -> dict[str, Any]:
+def _compute_scores(confusion: np.ndarray, classes: Sequence[str]) -> dict[str, Any]:
     """accuracy; by class, and as the mean of the classes that occur, precision, recall, F1, IoU."""
     right = np.diag(confusion)
     true, said = confusion.sum(axis=1), confusion.sum(axis=0)
     rows = {}
     for i, name in enumerate(classes):
-        rows[name] = {"objects": int(true[i]), "precision": _percent(right[i], said[i]),
-                      "recall": _percent(right[i], true[i]),
-                      "f1": _percent(2 * right[i], true[i] + said[i]),
-                      "iou": _percent(right[i], true[i] + said[i] - right[i])}
+        rows[name] = {"objects": int(true[i]), "precision": _to_percent(right[i], said[i]),
+                      "recall": _to_percent(right[i], true[i]),
+                      "f1": _to_percent(2 * right[i], true[i] + said[i]),
+                      "iou": _to_percent(right[i], true[i] + said[i] - right[i])}
     found = [row for row in rows.values() if row["objects"]]
     mean = {key: float(np.mean([row[key] or 0.0 for row in found])) if found else None
             for key in ("precision", "recall", "f1", "iou")}
     count = len(classes)
-    return {"confusion": confusion.tolist(), "accuracy": _percent(right.sum(), confusion.sum()),
-            "object_accuracy": _percent(right[:count].sum(), true[:count].sum()),
+    return {"confusion": confusion.tolist(), "accuracy": _to_percent(right.sum(), confusion.sum()),
+            "object_accuracy": _to_percent(right[:count].sum(), true[:count].sum()),
             "by_class": rows, "mean": mean}
 
 
-def _percent(part: int, whole: int) -> float | None:
+def _to_percent(part: int, whole: int) -> float | None:
     return 100.0 * float(part) / float(whole) if whole else None

@@ -19,9 +19,9 @@ from lidar_perception.scoring.points.segmentation import (
     ClusterReport,
     GroundReport,
     Objects,
-    ground_by_protocol,
-    objects_in_boxes,
-    objects_of_instances,
+    count_by_protocol,
+    find_instances,
+    find_objects_in_boxes,
     score_clusters,
 )
 from lidar_perception.types import SENSOR_HEIGHT, PointCloud
@@ -47,25 +47,29 @@ class SegmentationResult:
     whole: bool = False
 
 
-def by_methods(params: SegmentationParams, grounds: tuple[str, ...], clusterings: tuple[str, ...],
-               recording: Recording) -> Callable[[Frame], SegmentationResult | None]:
+def measure_methods(
+    params: SegmentationParams,
+    grounds: tuple[str, ...],
+    clusterings: tuple[str, ...],
+    recording: Recording,
+) -> Callable[[Frame], SegmentationResult | None]:
     """Runs the methods on every frame with labels. Ground is scored on labelled points, clusters on
     their instances, or on labelled boxes: then on the ground of params, in the camera's view where
     there is a camera. All but the recording given, a Start of scoring.run."""
-    timed = Timed()
+    timed = Timer()
 
     def on_points(frame: Frame, labels: Any) -> SegmentationResult:
         scan, found, ground = frame.load(), {}, {}
         z = scan.xyz[:, 2] + np.float32(frame.sensor_height - SENSOR_HEIGHT)
         for name in grounds:
             found[name], ms = timed(segment_ground, scan, replace(params.ground, method=name))
-            ground[name] = ground_by_protocol(found[name], labels.classes, z), ms
+            ground[name] = count_by_protocol(found[name], labels.classes, z), ms
         if not clusterings:
             return SegmentationResult(ground)
         chosen = found.get(params.ground.method)
         if chosen is None:
             chosen = segment_ground(scan, params.ground)
-        objects = objects_of_instances(scan.xyz, labels.classes, labels.instances)
+        objects = find_instances(scan.xyz, labels.classes, labels.instances)
         return SegmentationResult(ground, clustered(scan, chosen, objects))
 
     def on_boxes(frame: Frame, truth: Any) -> SegmentationResult:
@@ -73,7 +77,7 @@ def by_methods(params: SegmentationParams, grounds: tuple[str, ...], clusterings
         if camera is not None:
             _, scan = crop_to_view(scan, camera, params.view)
         return SegmentationResult({}, clustered(scan, segment_ground(scan, params.ground),
-                                                objects_in_boxes(scan.xyz, truth)),
+                                                find_objects_in_boxes(scan.xyz, truth)),
                                   whole=camera is None and params.view.enabled)
 
     def clustered(scan: PointCloud, ground: np.ndarray, objects: Objects) -> dict:
@@ -93,7 +97,7 @@ def by_methods(params: SegmentationParams, grounds: tuple[str, ...], clusterings
     return measure
 
 
-class Timed:
+class Timer:
     """timed(function, *arguments): the result and the milliseconds; the first time of a method
     after a run that loads compiled code."""
 
@@ -138,8 +142,8 @@ class SegmentationReport:
                 "skipped": self.skipped}
 
 
-def ground_of_methods(frame: Frame, params: SegmentationParams, grounds: tuple[str, ...]
-                      ) -> tuple[PointCloud, PointTruth | None, dict[str, np.ndarray]]:
+def segment_by_methods(frame: Frame, params: SegmentationParams, grounds: tuple[str, ...]
+                       ) -> tuple[PointCloud, PointTruth | None, dict[str, np.ndarray]]:
     """A frame, its labels, and the ground (N,) bool by each method, for a picture."""
     scan = frame.load()
     return scan, frame.point_truth(), {

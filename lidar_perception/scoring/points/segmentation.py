@@ -31,15 +31,15 @@ LOW_VEGETATION_Z = -1.3  # metres in the LiDAR frame of KITTI, 1.73 m above the 
 
 HIT_IOU = 0.5
 MIN_POINTS = 10      # objects with fewer points are not looked for
-BOTTOM = 0.2         # metres above the bottom of a box up to which its points may be the road's
-MARGIN = 0.2         # a cluster is judged if most of it is in labelled boxes grown by this
-PIECE = 0.1          # a cluster with this share of an object's points is a piece of it
+BOTTOM_MARGIN = 0.2  # metres above the bottom of a box up to which its points may be the road's
+BOX_MARGIN = 0.2         # a cluster is judged if most of it is in labelled boxes grown by this
+MIN_PIECE_SHARE = 0.1          # a cluster with this share of an object's points is a piece of it
 RANGE_NAMES = ("0-15", "15-30", "30-45", "45+")
 RANGE_LIMITS = np.array([15.0, 30.0, 45.0])
 
 
-def true_ground(semantic: np.ndarray, z: np.ndarray,
-                protocol: str) -> tuple[np.ndarray, np.ndarray]:
+def select_true_ground(semantic: np.ndarray, z: np.ndarray,
+                       protocol: str) -> tuple[np.ndarray, np.ndarray]:
     """ground (N,) bool and counted (N,) bool of points with classes semantic (N,) and heights
     z (N,) metres, as from KITTI's sensor. What is not counted is neither ground nor not ground."""
     ground, counted = np.isin(semantic, GROUND), ~np.isin(semantic, UNLABELLED)
@@ -51,25 +51,25 @@ def true_ground(semantic: np.ndarray, z: np.ndarray,
     return ground, counted
 
 
-def ground_counts(found: np.ndarray, ground: np.ndarray, counted: np.ndarray) -> np.ndarray:
+def count_ground(found: np.ndarray, ground: np.ndarray, counted: np.ndarray) -> np.ndarray:
     """(4,) int64 [tp fp fn tn] of found (N,) bool."""
     case = np.where(ground, np.where(found, 0, 2), np.where(found, 1, 3))
     return np.bincount(case.compress(counted), minlength=4)
 
 
-def ground_by_protocol(found: np.ndarray, semantic: np.ndarray,
-                       z: np.ndarray) -> dict[str, np.ndarray]:
+def count_by_protocol(found: np.ndarray, semantic: np.ndarray,
+                      z: np.ndarray) -> dict[str, np.ndarray]:
     """ground_counts of each protocol: found (N,) bool, classes (N,), heights (N,) metres, as from
     KITTI's sensor."""
-    return {name: ground_counts(found, *true_ground(semantic, z, name)) for name in PROTOCOLS}
+    return {name: count_ground(found, *select_true_ground(semantic, z, name)) for name in PROTOCOLS}
 
 
-def ground_row(counts: np.ndarray) -> dict:
+def to_ground_row(counts: np.ndarray) -> dict:
     """Counts (4,) and their ratios for the JSON file. A ratio without cases is 0."""
     tp, fp, fn, tn = counts.tolist()
-    return dict(tp=tp, fp=fp, fn=fn, tn=tn, precision=_ratio(tp, tp + fp),
-                recall=_ratio(tp, tp + fn), f1=_ratio(2 * tp, 2 * tp + fp + fn),
-                accuracy=_ratio(tp + tn, tp + fp + fn + tn))
+    return dict(tp=tp, fp=fp, fn=fn, tn=tn, precision=_divide(tp, tp + fp),
+                recall=_divide(tp, tp + fn), f1=_divide(2 * tp, 2 * tp + fp + fn),
+                accuracy=_divide(tp + tn, tp + fp + fn + tn))
 
 
 @dataclass
@@ -88,8 +88,8 @@ class GroundReport:
 
     def compute(self) -> dict:
         """What the JSON file holds."""
-        return {"scans": len(self.ms), "ms": _median(self.ms),
-                "protocols": {name: ground_row(c) for name, c in self.counts.items()}}
+        return {"scans": len(self.ms), "ms": _compute_median(self.ms),
+                "protocols": {name: to_ground_row(c) for name, c in self.counts.items()}}
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Objects:
     ranges: np.ndarray
 
 
-def objects_in_boxes(xyz: np.ndarray, truth: GroundTruth) -> Objects:
+def find_objects_in_boxes(xyz: np.ndarray, truth: GroundTruth) -> Objects:
     """Objects of labelled boxes, without DontCare, with at least MIN_POINTS points.
 
     A box stands on the road and holds some of it, so an object's points are those more than
@@ -123,17 +123,17 @@ def objects_in_boxes(xyz: np.ndarray, truth: GroundTruth) -> Objects:
         if CLASSES[truth.class_ids[k]] != "DontCare":
             inside = points_in_box(xyz, box)
             region[inside] = k + 1
-            owner[inside] = np.where(xyz[inside, 2] > box[2] - box[5] / 2 + BOTTOM, k + 1, 0)
+            owner[inside] = np.where(xyz[inside, 2] > box[2] - box[5] / 2 + BOTTOM_MARGIN, k + 1, 0)
     chosen = np.flatnonzero(np.bincount(owner, minlength=len(truth) + 1)[1:] >= MIN_POINTS)
     near = np.zeros(len(xyz), bool)
     for box in truth.boxes[chosen]:
-        near |= points_in_box(xyz, box, MARGIN)
-    return Objects(_renumbered(owner, chosen + 1), _renumbered(region, chosen + 1), near,
+        near |= points_in_box(xyz, box, BOX_MARGIN)
+    return Objects(_renumber(owner, chosen + 1), _renumber(region, chosen + 1), near,
                    np.ones(len(xyz), bool), tuple(truth.labels[k] for k in chosen),
                    np.hypot(*truth.boxes[chosen, :2].T))
 
 
-def objects_of_instances(xyz: np.ndarray, semantic: np.ndarray, instance: np.ndarray) -> Objects:
+def find_instances(xyz: np.ndarray, semantic: np.ndarray, instance: np.ndarray) -> Objects:
     """Objects of SemanticKITTI with at least MIN_POINTS points: things of one class and instance,
     moving or not. Left out: unlabelled points, outliers, things without an instance, and objects
     of fewer points."""
@@ -145,7 +145,7 @@ def objects_of_instances(xyz: np.ndarray, semantic: np.ndarray, instance: np.nda
                                              thing << 16 | instance, 0),
                                     return_inverse=True, return_counts=True)
     chosen = np.flatnonzero((keys > 0) & (counts >= MIN_POINTS))
-    owner = _renumbered(which.reshape(-1), chosen)
+    owner = _renumber(which.reshape(-1), chosen)
     sums = [np.bincount(owner, axis, minlength=len(chosen) + 1)[1:] for axis in xyz[:, :2].T]
     centres = np.stack(sums, axis=1) / counts[chosen, None]
     counted = (owner > 0) | ((thing == 0) & ~np.isin(semantic, UNLABELLED))
@@ -184,7 +184,7 @@ def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
     thing, cluster = np.divmod(pairs, len(size))
     # A point of an object is in its region, so each pair is among those of the regions.
     iou = common / (size[cluster] + points[thing] - inside[np.searchsorted(touched, pairs)])
-    piece = common >= PIECE * points[thing]
+    piece = common >= MIN_PIECE_SHARE * points[thing]
     best = np.zeros(rows)
     np.maximum.at(best, thing, iou)
     several = np.bincount(cluster[piece], minlength=len(size)) > 1
@@ -210,49 +210,49 @@ class ClusterReport:
     def compute(self) -> dict:
         """What the JSON file holds. precision: share of the judged clusters that are hits."""
         classes = np.array([c for names, _, _ in self.frames for c in names], str)
-        ranges = _joined(each for _, each, _ in self.frames)
+        ranges = _concatenate(each for _, each, _ in self.frames)
         bins = np.searchsorted(RANGE_LIMITS, ranges, "right")
-        columns = [_joined(getattr(score, name) for _, _, score in self.frames)
+        columns = [_concatenate(getattr(score, name) for _, _, score in self.frames)
                    for name in ("iou", "pieces", "shared")]
-        everything = _object_row(*columns)
+        everything = _to_object_row(*columns)
         clusters, judged = (sum(getattr(score, name) for _, _, score in self.frames)
                             for name in ("clusters", "judged"))
         hits = everything["hits"]
-        return {"frames": len(self.frames), "ms": _median(self.ms), "clusters": clusters,
-                "clusters_per_frame": _ratio(clusters, len(self.frames)),
-                "judged_clusters": judged, **everything, "precision": _ratio(hits, judged),
-                "f1": _ratio(2 * hits, judged + everything["objects"]),
-                "by_class": {str(name): _object_row(*(c[classes == name] for c in columns))
+        return {"frames": len(self.frames), "ms": _compute_median(self.ms), "clusters": clusters,
+                "clusters_per_frame": _divide(clusters, len(self.frames)),
+                "judged_clusters": judged, **everything, "precision": _divide(hits, judged),
+                "f1": _divide(2 * hits, judged + everything["objects"]),
+                "by_class": {str(name): _to_object_row(*(c[classes == name] for c in columns))
                              for name in np.unique(classes)},
-                "by_range": {name: _object_row(*(c[bins == i] for c in columns))
+                "by_range": {name: _to_object_row(*(c[bins == i] for c in columns))
                              for i, name in enumerate(RANGE_NAMES)}}
 
 
-def _object_row(iou: np.ndarray, pieces: np.ndarray, shared: np.ndarray) -> dict:
+def _to_object_row(iou: np.ndarray, pieces: np.ndarray, shared: np.ndarray) -> dict:
     """mean_pieces is over the objects that have a piece; 1 is none cut, None without any."""
     count, hits = len(iou), int(np.sum(iou > HIT_IOU))
     over, under = int(np.sum(pieces > 1)), int(np.sum(shared))
-    return dict(objects=count, hits=hits, recall=_ratio(hits, count),
-                mean_iou=_ratio(float(np.sum(iou)), count),
-                over_segmented=over, over_segmentation=_ratio(over, count),
+    return dict(objects=count, hits=hits, recall=_divide(hits, count),
+                mean_iou=_divide(float(np.sum(iou)), count),
+                over_segmented=over, over_segmentation=_divide(over, count),
                 mean_pieces=float(np.mean(pieces[pieces > 0])) if (pieces > 0).any() else None,
-                under_segmented=under, under_segmentation=_ratio(under, count))
+                under_segmented=under, under_segmentation=_divide(under, count))
 
 
-def _renumbered(ids: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+def _renumber(ids: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """(N,) int32: 1.. in the order of chosen where ids (N,) is among them, else 0."""
     table = np.zeros(max(ids.max(initial=0), chosen.max(initial=0)) + 1, np.int32)
     table[chosen] = np.arange(1, len(chosen) + 1)
     return table[ids]
 
 
-def _joined(parts) -> np.ndarray:
+def _concatenate(parts) -> np.ndarray:
     return np.concatenate([np.zeros(0), *parts])
 
 
-def _median(values: list[float]) -> float | None:
+def _compute_median(values: list[float]) -> float | None:
     return float(np.median(values)) if values else None
 
 
-def _ratio(part: float, whole: float) -> float:
+def _divide(part: float, whole: float) -> float:
     return part / whole if whole else 0.0

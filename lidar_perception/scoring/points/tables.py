@@ -8,15 +8,20 @@ import numpy as np
 from rich.console import Console
 
 from lidar_perception.scoring.pictures import save_picture
-from lidar_perception.scoring.points.segmentation import HIT_IOU, MIN_POINTS, PROTOCOLS, true_ground
-from lidar_perception.scoring.tables import counts, narrow_table, percent, print_skipped
+from lidar_perception.scoring.points.segmentation import (
+    HIT_IOU,
+    MIN_POINTS,
+    PROTOCOLS,
+    select_true_ground,
+)
+from lidar_perception.scoring.tables import format_counts, format_percent, make_table, print_skipped
 from lidar_perception.types import PointCloud
 
 # Patchwork++ on sequences 00 to 10 of SemanticKITTI, mean of the sequences, in percent: precision,
 # recall, F1. The first from the paper (IROS 2022, Table I), the second from its repository.
 PUBLISHED = {"without vegetation": (94.92, 98.18, 96.51), "with vegetation": (93.72, 92.33, 92.87)}
 
-RANGE = 50.0  # metres to each side that are drawn
+MAX_DRAWN_RANGE = 50.0  # metres to each side that are drawn
 
 
 def print_scores(content: dict, ground_method: str, console: Console) -> None:
@@ -31,15 +36,19 @@ def print_scores(content: dict, ground_method: str, console: Console) -> None:
 
 def _print_ground(reports: dict, console: Console) -> None:
     scans = max(report["scans"] for report in reports.values())
-    table = narrow_table(f"Ground of SemanticKITTI, {_count(scans, 'scan')}", "vegetation is",
-                         "prec.", "recall", "F1", "acc.", "TP", "FP", "FN", "ms")
+    table = make_table(f"Ground of SemanticKITTI, {_format_count(scans, 'scan')}", "vegetation is",
+                       "prec.", "recall", "F1", "acc.", "TP", "FP", "FN", "ms")
     titles = dict(zip(PROTOCOLS, ("left out", "ground if below -1.3 m", "not ground")))
     for protocol in PROTOCOLS:
         table.add_row(titles[protocol], style="bold")
         for name, report in reports.items():
             row = report["protocols"][protocol]
-            table.add_row(f"  {name}", *percent(row, "precision", "recall", "f1", "accuracy"),
-                          *counts(row, "tp", "fp", "fn"), _ms(report))
+            table.add_row(
+                f"  {name}",
+                *format_percent(row, "precision", "recall", "f1", "accuracy"),
+                *format_counts(row, "tp", "fp", "fn"),
+                _format_ms(report),
+            )
         if protocol in PUBLISHED:
             table.add_row("  Patchwork++ published", *(f"{v:.1f}" for v in PUBLISHED[protocol]),
                           style="dim")
@@ -50,15 +59,15 @@ def _print_ground(reports: dict, console: Console) -> None:
 
 def _print_clusters(reports: dict, title: str, console: Console) -> None:
     frames = max(report["frames"] for report in reports.values())
-    table = narrow_table(f"{title}, {_count(frames, 'frame')}", "method", "objects", "hits",
-                         "recall", "prec.", "F1", "IoU", "over", "under", "found", "ms")
+    table = make_table(f"{title}, {_format_count(frames, 'frame')}", "method", "objects", "hits",
+                       "recall", "prec.", "F1", "IoU", "over", "under", "found", "ms")
     for name, report in reports.items():
-        table.add_row(name, *_object_cells(report), f"{report['clusters_per_frame']:.1f}",
-                      _ms(report), style="bold")
+        table.add_row(name, *_format_object(report), f"{report['clusters_per_frame']:.1f}",
+                      _format_ms(report), style="bold")
         parts = {**report["by_class"], **{f"{r} m": row for r, row in report["by_range"].items()}}
         for part, row in parts.items():
             if row["objects"]:
-                table.add_row(f"  {part}", *_object_cells(row))
+                table.add_row(f"  {part}", *_format_object(row))
         table.add_section()
     table.caption = (f"Objects with {MIN_POINTS} points or more; hit: IoU above {HIT_IOU} with one "
                      "cluster. over: cut in pieces; under: in one cluster with another; found: "
@@ -66,18 +75,18 @@ def _print_clusters(reports: dict, title: str, console: Console) -> None:
     console.print(table)
 
 
-def _object_cells(row: dict) -> list[str]:
+def _format_object(row: dict) -> list[str]:
     """Precision and F1 are known for all objects together only."""
-    judged = percent(row, "precision", "f1") if "precision" in row else ("", "")
-    return [*counts(row, "objects", "hits"), *percent(row, "recall"), *judged,
-            *percent(row, "mean_iou", "over_segmentation", "under_segmentation")]
+    judged = format_percent(row, "precision", "f1") if "precision" in row else ("", "")
+    return [*format_counts(row, "objects", "hits"), *format_percent(row, "recall"), *judged,
+            *format_percent(row, "mean_iou", "over_segmentation", "under_segmentation")]
 
 
-def _ms(report: dict) -> str:
+def _format_ms(report: dict) -> str:
     return f"{report['ms']:.{0 if report['ms'] >= 100 else 1}f}"
 
 
-def _count(count: int, noun: str) -> str:
+def _format_count(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
@@ -89,7 +98,7 @@ def draw_ground(path: Path, name: str, frame: PointCloud, semantic: np.ndarray,
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    true, counted = true_ground(semantic, frame.xyz[:, 2], "without vegetation")
+    true, counted = select_true_ground(semantic, frame.xyz[:, 2], "without vegetation")
     figure, rows = plt.subplots(1, len(found), figsize=(7 * len(found), 7.6), dpi=110,
                                 squeeze=False, layout="constrained")
     for axes, (method, ground) in zip(rows[0], found.items()):
@@ -101,8 +110,14 @@ def draw_ground(path: Path, name: str, frame: PointCloud, semantic: np.ndarray,
                 (counted & ~true & ground, "#d55e00", "found, but not ground", 1.2)):
             axes.scatter(-frame.xyz[mask, 1], frame.xyz[mask, 0], s=size, c=color, linewidths=0,
                          label=f"{label} ({int(mask.sum())})")
-        axes.set(xlim=(-RANGE, RANGE), ylim=(-RANGE, RANGE), aspect="equal",
-                 xlabel="right [m]", ylabel="forward [m]", title=f"{method}, scan {name}")
+        axes.set(
+            xlim=(-MAX_DRAWN_RANGE, MAX_DRAWN_RANGE),
+            ylim=(-MAX_DRAWN_RANGE, MAX_DRAWN_RANGE),
+            aspect="equal",
+            xlabel="right [m]",
+            ylabel="forward [m]",
+            title=f"{method}, scan {name}",
+        )
         for handle in axes.legend(loc="upper right", framealpha=0.9).legend_handles:
             handle.set_sizes([30])
     save_picture(path, figure)

@@ -6,9 +6,11 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 
-from lidar_perception.scoring.tracking.pairs import ALIKE, EPS, Pairs, best_pairs
+from lidar_perception.scoring.tracking.pairs import EPS, MIN_SIMILARITY, Pairs, find_best_pairs
 
-KEEP = 1000.0  # gain of going on with the track of the frame before, above any similarity
+CONTINUATION_GAIN = (
+    1000.0  # gain of going on with the track of the frame before, above any similarity
+)
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class ClearCounts:
                 "recall": self.tp / objects, "precision": self.tp / max(1, self.tp + self.fp)}
 
 
-def clear_counts(frames: list[Pairs], alike: float = ALIKE) -> ClearCounts:
+def count_clear(frames: list[Pairs], alike: float = MIN_SIMILARITY) -> ClearCounts:
     """The counts of one sequence, its frames in order, as without_ignored gives them. Boxes from a
     similarity of `alike` on can match; a pair of the frame before goes on where it can."""
     true_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.true_ids for f in frames)]))
@@ -54,8 +56,8 @@ def clear_counts(frames: list[Pairs], alike: float = ALIKE) -> ClearCounts:
         fp += len(f.track_ids)
         if len(i) == 0 or len(f.track_ids) == 0:
             continue  # what was matched before can go on after such a frame, as in TrackEval
-        gain = KEEP * (f.track_ids == before[i][:, None]) + f.similarity
-        rows, columns = best_pairs(np.where(f.similarity < alike - EPS, 0.0, gain))
+        gain = CONTINUATION_GAIN * (f.track_ids == before[i][:, None]) + f.similarity
+        rows, columns = find_best_pairs(np.where(f.similarity < alike - EPS, 0.0, gain))
         who, ids = i[rows], f.track_ids[columns]
         switches += int(((last[who] >= 0) & (last[who] != ids)).sum())
         runs[who] += before[who] < 0

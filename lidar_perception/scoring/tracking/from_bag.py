@@ -10,8 +10,8 @@ import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.drives import is_same_drive
-from lidar_perception.scoring.recorded import Answered
-from lidar_perception.scoring.tracking.pairs import tracked_labels
+from lidar_perception.scoring.recorded import RecordedResult
+from lidar_perception.scoring.tracking.pairs import to_tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import to_detections, to_truth
@@ -27,8 +27,8 @@ class RecordedTracks:
     problem: str | None = None
 
 
-def recorded_tracks(frames: Sequence[Answered], calibration: Calibration | None
-                    ) -> RecordedTracks:
+def score_recorded_tracks(frames: Sequence[RecordedResult], calibration: Calibration | None
+                          ) -> RecordedTracks:
     """The tracks in answered frames."""
     labels = [(label, i) for frame in frames
               for i, label in zip(frame.found.ids.tolist(), frame.found.labels)]
@@ -39,7 +39,7 @@ def recorded_tracks(frames: Sequence[Answered], calibration: Calibration | None
         for i, frame in enumerate(frames):
             drive += not is_same_drive(before, frame.stamp_ns)
             before = frame.stamp_ns
-            report.update(observe(f"drive {drive}", i, to_truth(frame.truth), tracked_labels(
+            report.update(observe(f"drive {drive}", i, to_truth(frame.truth), to_tracked_labels(
                 np.asarray(frame.found.ids), to_detections(frame.found)), calibration))
     except InputError as error:
         return RecordedTracks(count, {}, str(error))

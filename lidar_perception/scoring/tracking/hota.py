@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lidar_perception.scoring.tracking.pairs import EPS, Pairs, best_pairs
+from lidar_perception.scoring.tracking.pairs import EPS, Pairs, find_best_pairs
 
 ALPHAS = np.arange(0.05, 0.99, 0.05)  # 19 similarities from which on two boxes are one
 
@@ -44,26 +44,26 @@ class HotaCounts:
         return {name: float(curve.mean()) for name, curve in curves.items()}
 
 
-def hota_counts(frames: list[Pairs]) -> HotaCounts:
+def count_hota(frames: list[Pairs]) -> HotaCounts:
     """The counts of one sequence; its frames in order, as without_ignored gives them."""
     true_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.true_ids for f in frames)]))
     track_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.track_ids for f in frames)]))
     indices = [(np.searchsorted(true_ids, f.true_ids), np.searchsorted(track_ids, f.track_ids))
               for f in frames]
-    together = np.zeros((len(true_ids), len(track_ids)))
+    concatenate = np.zeros((len(true_ids), len(track_ids)))
     true_count, track_count = np.zeros((len(true_ids), 1)), np.zeros((1, len(track_ids)))
     for f, (i, j) in zip(frames, indices):
         s = f.similarity
         either = s.sum(axis=0) + s.sum(axis=1)[:, None] - s
-        together[np.ix_(i, j)] += np.divide(s, either, out=np.zeros_like(s), where=either > EPS)
+        concatenate[np.ix_(i, j)] += np.divide(s, either, out=np.zeros_like(s), where=either > EPS)
         true_count[i] += 1
         track_count[0, j] += 1
-    alignment = together / np.maximum(true_count + track_count - together, EPS)
+    alignment = concatenate / np.maximum(true_count + track_count - concatenate, EPS)
     matches = np.zeros((len(ALPHAS), len(true_ids), len(track_ids)))
     located = _zeros()
     for f, (i, j) in zip(frames, indices):
         # Pairs that nothing speaks for may match too; they are below every alpha.
-        rows, columns = best_pairs(alignment[np.ix_(i, j)] * f.similarity)
+        rows, columns = find_best_pairs(alignment[np.ix_(i, j)] * f.similarity)
         alike = f.similarity[rows, columns]
         good = alike >= ALPHAS[:, None] - EPS
         matches[:, i[rows], j[columns]] += good

@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from lidar_perception.scoring.tracking.pairs import Pairs
 
-OVERLAP = 0.25  # of boxes that can match
+MIN_OVERLAP = 0.25  # of boxes that can match
 STEPS = 40      # recall 1/40, 2/40, .. 1
 FORBIDDEN = 1e6  # cost of a pair that overlaps too little
 
@@ -49,15 +49,15 @@ class RecallPoint:
         return min(1.0, max(0.0, 1 - wrong / (self.recall * self.objects)))
 
 
-def over_recall(sequences: list[list[Pairs]]) -> dict[str, float | None]:
+def score_over_recall(sequences: list[list[Pairs]]) -> dict[str, float | None]:
     """sAMOTA, AMOTA, AMOTP, and best_MOTA with its threshold best_score, of sequences of frames in
     order (as pairs_of gives them); 0 without a track that matches, best_score then None."""
-    means = [_mean_scores(frames) for frames in sequences]
+    means = [_average_scores(frames) for frames in sequences]
     matched = [[np.zeros(len(f.track_ids), bool) for f in frames] for frames in sequences]
     hits: list[float] = []
-    first = _count(sequences, means, matched, -np.inf, 1.0, hits)
-    points = [_count(sequences, means, matched, threshold, recall, [])
-              for threshold, recall in _thresholds(np.array(hits), first.tp + first.fn)]
+    first = _count_at_threshold(sequences, means, matched, -np.inf, 1.0, hits)
+    points = [_count_at_threshold(sequences, means, matched, threshold, recall, [])
+              for threshold, recall in _choose_thresholds(np.array(hits), first.tp + first.fn)]
     best = max(points, key=lambda p: p.mota, default=None)
     if best is None or best.mota <= 0:
         best = None
@@ -67,7 +67,7 @@ def over_recall(sequences: list[list[Pairs]]) -> dict[str, float | None]:
             "best_MOTA": best.mota if best else 0.0, "best_score": best.threshold if best else None}
 
 
-def _mean_scores(frames: list[Pairs]) -> dict[int, float]:
+def _average_scores(frames: list[Pairs]) -> dict[int, float]:
     scores: dict[int, list[float]] = {}
     for f in frames:
         for i, score in zip(f.track_ids.tolist(), f.scores.tolist()):
@@ -75,7 +75,7 @@ def _mean_scores(frames: list[Pairs]) -> dict[int, float]:
     return {i: sum(values) / len(values) for i, values in scores.items()}
 
 
-def _thresholds(scores: np.ndarray, objects: int) -> list[tuple[float, float]]:
+def _choose_thresholds(scores: np.ndarray, objects: int) -> list[tuple[float, float]]:
     """Score and recall: of the scores of all hits those nearest to recall 1/40, 2/40, .."""
     ordered, chosen, wanted = np.sort(scores)[::-1], [], 0.0
     for i, score in enumerate(ordered.tolist()):
@@ -88,9 +88,9 @@ def _thresholds(scores: np.ndarray, objects: int) -> list[tuple[float, float]]:
     return chosen[1:]
 
 
-def _count(sequences: list[list[Pairs]], means: list[dict[int, float]],
-           matched: list[list[np.ndarray]], threshold: float, recall: float,
-           hits: list[float]) -> RecallPoint:
+def _count_at_threshold(sequences: list[list[Pairs]], means: list[dict[int, float]],
+                        matched: list[list[np.ndarray]], threshold: float, recall: float,
+                        hits: list[float]) -> RecallPoint:
     """One pass. hits gets the score of every hit; matched is kept up: a track that once matched is
     never excused again, as in the script."""
     tp = fn = fp = switches = objects = 0
@@ -100,7 +100,7 @@ def _count(sequences: list[list[Pairs]], means: list[dict[int, float]],
         for f, matched_once in zip(frames, was):
             average = np.array([score[i] for i in f.track_ids.tolist()])
             kept = np.flatnonzero(average >= threshold) if len(average) else np.zeros(0, int)
-            rows, columns = _matched(f.overlap[:, kept])
+            rows, columns = _match(f.overlap[:, kept])
             columns = kept[columns]
             matched_once[columns] = True
             hits += average[columns].tolist()
@@ -116,18 +116,18 @@ def _count(sequences: list[list[Pairs]], means: list[dict[int, float]],
             ids[rows] = f.track_ids[columns]
             for true_id, track, ignored in zip(f.true_ids.tolist(), ids.tolist(), f.ignored):
                 stories.setdefault(true_id, []).append((track, bool(ignored)))
-        switches += sum(map(_switches, stories.values()))
+        switches += sum(map(_count_switches, stories.values()))
     return RecallPoint(threshold, recall, tp, fn, fp, switches, objects, overlap)
 
 
-def _matched(overlap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    cost = np.where(overlap >= OVERLAP, 1.0 - overlap, FORBIDDEN)
+def _match(overlap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    cost = np.where(overlap >= MIN_OVERLAP, 1.0 - overlap, FORBIDDEN)
     rows, columns = linear_sum_assignment(cost)
     good = cost[rows, columns] < FORBIDDEN
     return rows[good], columns[good]
 
 
-def _switches(story: list[tuple[int, bool]]) -> int:
+def _count_switches(story: list[tuple[int, bool]]) -> int:
     """Of one label: in each of its frames the track it was found by, or -1, and whether it was
     one that need not be found."""
     count, last = 0, story[0][0]

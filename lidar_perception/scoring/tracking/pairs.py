@@ -15,15 +15,15 @@ from scipy.optimize import linear_sum_assignment
 from lidar_perception.camera import Calibration
 from lidar_perception.classes import DETECTED
 from lidar_perception.geometry import iou_3d
-from lidar_perception.scoring.kitti.camera_objects import CameraObjects, camera_objects
+from lidar_perception.scoring.kitti.camera_objects import CameraObjects, to_camera_objects
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 
 MAX_OCCLUSION, MAX_TRUNCATION = 2, 0  # levels of the tracking layout
 MIN_HEIGHT = 25.0    # pixels
-IN_REGION = 0.5      # share of a box in a DontCare region
-FAR = 2.0            # metres between centres from which on two boxes are not alike at all
-ALIKE = 0.5          # for CLEAR MOT, and for what is left out
+MAX_REGION_SHARE = 0.5      # share of a box in a DontCare region
+MAX_CENTRE_DISTANCE = 2.0  # metres between centres from which on two boxes are not alike at all
+MIN_SIMILARITY = 0.5          # for CLEAR MOT, and for what is left out
 EPS = np.finfo(float).eps  # as TrackEval compares
 
 SIMILARITIES = ("centres", "3d", "image")
@@ -48,14 +48,14 @@ class Pairs:
     overlap: np.ndarray
 
 
-def tracked_labels(ids: np.ndarray, detections: Detections) -> GroundTruth:
+def to_tracked_labels(ids: np.ndarray, detections: Detections) -> GroundTruth:
     """Tracks with ids (K,) as labels with track_id and score."""
     return GroundTruth.of(detections.boxes, detections.class_ids, [
         {"track_id": int(i), "score": float(s)} for i, s in zip(ids, detections.scores)])
 
 
-def pairs_of(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration | None,
-             similarity: str = "centres") -> dict[str, Pairs]:
+def make_pairs(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration | None,
+               similarity: str = "centres") -> dict[str, Pairs]:
     """One frame by class that is detected. truth and tracks with a track_id in every extra, tracks
     with a score too. Without a calibration nothing is too small, and there are no DontCare regions.
 
@@ -66,20 +66,24 @@ def pairs_of(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration |
         raise InputError(f"similarity = {similarity!r} must be one of {', '.join(SIMILARITIES)}")
     if similarity == "image" and calibration is None:
         raise InputError("similarity in the image needs a calibration; take 'centres' or '3d'")
-    true_ids, track_ids = ids_of(truth, "label"), ids_of(tracks, "track")
-    true, found = (camera_objects(objects, calibration) for objects in (truth, tracks))
+    true_ids, track_ids = read_track_ids(truth, "label"), read_track_ids(tracks, "track")
+    true, found = (to_camera_objects(objects, calibration) for objects in (truth, tracks))
     # Regions without a box come last there, and are in .regions.
     true_objects, objects = true.take(np.arange(len(truth))), found.take(np.arange(len(tracks)))
     ignored = np.array([extra.get("occluded", 0) > MAX_OCCLUSION or round(
         extra.get("truncated", 0)) > MAX_TRUNCATION for extra in truth.extras], bool)
     ignored |= true_objects.pixels_high == 0
-    excused = (objects.pixels_high <= MIN_HEIGHT + EPS) | _in_regions(
+    excused = (objects.pixels_high <= MIN_HEIGHT + EPS) | _find_in_regions(
         objects.image_boxes, true.regions)
-    return {name: _of_class(name, true_objects, objects, true_ids, track_ids, ignored, excused,
-                            similarity) for name in DETECTED}
+    return {
+        name: _make_class_pairs(
+            name, true_objects, objects, true_ids, track_ids, ignored, excused, similarity
+        )
+        for name in DETECTED
+    }
 
 
-def ids_of(objects: GroundTruth, what: str) -> np.ndarray:
+def read_track_ids(objects: GroundTruth, what: str) -> np.ndarray:
     """(N,) int64 track ids. InputError where one is missing (KITTI writes -1), or there twice."""
     ids = np.array([extra.get("track_id", -1) for extra in objects.extras], np.int64)
     if (ids < 0).any():
@@ -90,9 +94,9 @@ def ids_of(objects: GroundTruth, what: str) -> np.ndarray:
     return ids
 
 
-def _of_class(name: str, true: CameraObjects, found: CameraObjects, true_ids: np.ndarray,
-              track_ids: np.ndarray, ignored: np.ndarray, excused: np.ndarray,
-              similarity: str) -> Pairs:
+def _make_class_pairs(name: str, true: CameraObjects, found: CameraObjects, true_ids: np.ndarray,
+                      track_ids: np.ndarray, ignored: np.ndarray, excused: np.ndarray,
+                      similarity: str) -> Pairs:
     own, other = CLASSES.index(name), CLASSES.index(NEIGHBOURS.get(name, name))
     rows = np.flatnonzero(np.isin(true.class_ids, [own, other]))
     columns = np.flatnonzero(found.class_ids == own)
@@ -100,15 +104,15 @@ def _of_class(name: str, true: CameraObjects, found: CameraObjects, true_ids: np
     overlap = iou_3d(labels.boxes, tracks.boxes)
     if similarity == "centres":
         apart = np.linalg.norm(labels.boxes[:, None, :3] - tracks.boxes[None, :, :3], axis=2)
-        alike = np.maximum(1.0 - apart / FAR, 0.0)
+        alike = np.maximum(1.0 - apart / MAX_CENTRE_DISTANCE, 0.0)
     else:
-        alike = overlap if similarity == "3d" else image_iou(labels.image_boxes,
-                                                             tracks.image_boxes)
+        alike = overlap if similarity == "3d" else compute_image_iou(labels.image_boxes,
+                                                                     tracks.image_boxes)
     return Pairs(true_ids[rows], ignored[rows] | (labels.class_ids != own), track_ids[columns],
                  tracks.scores, excused[columns], alike, overlap)
 
 
-def image_iou(boxes: np.ndarray, others: np.ndarray, of_first: bool = False) -> np.ndarray:
+def compute_image_iou(boxes: np.ndarray, others: np.ndarray, of_first: bool = False) -> np.ndarray:
     """(K, M) IoU of 2D boxes (K, 4) and (M, 4) [left top right bottom]; of_first: the share of
     each of boxes that lies in others. 0 for a box without area."""
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
@@ -119,14 +123,16 @@ def image_iou(boxes: np.ndarray, others: np.ndarray, of_first: bool = False) -> 
     return np.divide(shared, whole, out=np.zeros_like(shared), where=whole > EPS)
 
 
-def _in_regions(boxes: np.ndarray, regions: np.ndarray) -> np.ndarray:
-    return np.any(image_iou(boxes, regions, of_first=True) > IN_REGION + EPS, axis=1)
+def _find_in_regions(boxes: np.ndarray, regions: np.ndarray) -> np.ndarray:
+    return np.any(compute_image_iou(boxes, regions, of_first=True) > MAX_REGION_SHARE + EPS, axis=1)
 
 
-def without_ignored(pairs: Pairs) -> Pairs:
+def drop_ignored(pairs: Pairs) -> Pairs:
     """What HOTA and CLEAR MOT count: without the labels that need not be found, the tracks matched
     to them, and excused tracks that match nothing."""
-    rows, columns = best_pairs(np.where(pairs.similarity < ALIKE - EPS, 0.0, pairs.similarity))
+    rows, columns = find_best_pairs(
+        np.where(pairs.similarity < MIN_SIMILARITY - EPS, 0.0, pairs.similarity)
+    )
     gone = pairs.excused.copy()
     gone[columns] = pairs.ignored[rows]
     labels, tracks = np.flatnonzero(~pairs.ignored), np.flatnonzero(~gone)
@@ -137,7 +143,7 @@ def without_ignored(pairs: Pairs) -> Pairs:
                    overlap=pairs.overlap[both])
 
 
-def best_pairs(gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_best_pairs(gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows (P,) and columns (P,) of the greatest sum of gain (M, K), only those above 0."""
     rows, columns = linear_sum_assignment(gain, maximize=True)
     good = gain[rows, columns] > EPS

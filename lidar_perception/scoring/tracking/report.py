@@ -11,15 +11,15 @@ from lidar_perception.classes import DETECTED
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.scoring.run import Start
-from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
-from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
-from lidar_perception.scoring.tracking.over_recall import over_recall
+from lidar_perception.scoring.tracking.clear import ClearCounts, count_clear
+from lidar_perception.scoring.tracking.hota import HotaCounts, count_hota
+from lidar_perception.scoring.tracking.over_recall import score_over_recall
 from lidar_perception.scoring.tracking.pairs import (
     Pairs,
-    ids_of,
-    pairs_of,
-    tracked_labels,
-    without_ignored,
+    drop_ignored,
+    make_pairs,
+    read_track_ids,
+    to_tracked_labels,
 )
 from lidar_perception.tracking.drive_tracker import DriveTracker
 from lidar_perception.tracking.params import TrackingParams
@@ -41,34 +41,41 @@ def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
             calibration: Calibration | None = None, similarity: str = "centres") -> Observation:
     """As pairs_of. InputError, with sequence and frame, where it cannot be scored."""
     try:
-        return Observation(sequence, index, pairs_of(truth, tracks, calibration, similarity))
+        return Observation(sequence, index, make_pairs(truth, tracks, calibration, similarity))
     except InputError as error:
         raise InputError(f"{sequence}/{index}: {error}") from None
 
 
-def by_tracker(open_: Callable[[], Detector], params: TrackingParams = TrackingParams(),
-               ego: str = "auto") -> Start:
+def measure_tracking(open_: Callable[[], Detector], params: TrackingParams = TrackingParams(),
+                     ego: str = "auto") -> Start:
     """Track what the detector of open_() finds, see DriveTracker. Frames must be measured in order
     of time, in one process."""
-    return partial(_by_tracker, open_, params, ego)
+    return partial(_measure_tracking, open_, params, ego)
 
 
-def _by_tracker(open_: Callable[[], Detector], params: TrackingParams, ego: str,
-                recording: Recording) -> Callable[[Frame], Observation | None]:
+def _measure_tracking(open_: Callable[[], Detector], params: TrackingParams, ego: str,
+                      recording: Recording) -> Callable[[Frame], Observation | None]:
     tracker = DriveTracker(recording, params, ego)
     detector = open_()
 
     def measure(frame: Frame) -> Observation | None:
         truth = frame.truth()
         if truth is not None:
-            ids_of(truth, "label")  # before the detector's work
+            read_track_ids(truth, "label")  # before the detector's work
         frame = frame.with_cached_scan()
         tracks = tracker(frame, detector(frame.load()).detections)
         if truth is None:
             return None
-        return replace(observe(tracker.drive, frame.index, truth,
-                               tracked_labels(tracks.ids, tracks.detections), frame.calibration()),
-                       posed=tracker.has_pose)
+        return replace(
+            observe(
+                tracker.drive,
+                frame.index,
+                truth,
+                to_tracked_labels(tracks.ids, tracks.detections),
+                frame.calibration(),
+            ),
+            posed=tracker.has_pose,
+        )
     return measure
 
 
@@ -92,28 +99,46 @@ class TrackingReport:
         names = sorted({sequence for sequence, _ in self.frames})
         ordered = {name: [self.frames[key] for key in sorted(self.frames) if key[0] == name]
                    for name in names}
-        return {"frames": len(self.frames), "without_pose": len(self.unposed),
-                "sequences": len(names), "skipped": self.skipped,
-                "classes": {name: _class([[frame[name] for frame in frames]
-                                          for frames in ordered.values()]) for name in DETECTED}}
+        return {
+            "frames": len(self.frames),
+            "without_pose": len(self.unposed),
+            "sequences": len(names),
+            "skipped": self.skipped,
+            "classes": {
+                name: _score_class(
+                    [[frame[name] for frame in frames] for frames in ordered.values()]
+                )
+                for name in DETECTED
+            },
+        }
 
 
-def _class(sequences: list[list[Pairs]]) -> dict | None:
-    counted = [[without_ignored(f) for f in frames] for frames in sequences]
+def _score_class(sequences: list[list[Pairs]]) -> dict | None:
+    counted = [[drop_ignored(f) for f in frames] for frames in sequences]
     hota, clear = HotaCounts(), ClearCounts()
     for frames in counted:
-        hota, clear = hota + hota_counts(frames), clear + clear_counts(frames)
+        hota, clear = hota + count_hota(frames), clear + count_clear(frames)
     if clear.tp + clear.fn + clear.fp == 0:
         return None
-    return {**hota.scores(), **clear.scores(), **over_recall(sequences),
-            "labels": clear.tp + clear.fn, "boxes": clear.tp + clear.fp,
-            "true_tracks": _tracks(counted, "true_ids"), "tracks": _tracks(counted, "track_ids"),
-            "hits": clear.tp, "misses": clear.fn, "false": clear.fp,
-            "switches": clear.switches, "fragments": clear.fragments,
-            "mostly_tracked": clear.mostly_tracked, "partly_tracked": clear.partly_tracked,
-            "mostly_lost": clear.mostly_lost}
+    return {
+        **hota.scores(),
+        **clear.scores(),
+        **score_over_recall(sequences),
+        "labels": clear.tp + clear.fn,
+        "boxes": clear.tp + clear.fp,
+        "true_tracks": _count_tracks(counted, "true_ids"),
+        "tracks": _count_tracks(counted, "track_ids"),
+        "hits": clear.tp,
+        "misses": clear.fn,
+        "false": clear.fp,
+        "switches": clear.switches,
+        "fragments": clear.fragments,
+        "mostly_tracked": clear.mostly_tracked,
+        "partly_tracked": clear.partly_tracked,
+        "mostly_lost": clear.mostly_lost,
+    }
 
 
-def _tracks(sequences: list[list[Pairs]], name: str) -> int:
+def _count_tracks(sequences: list[list[Pairs]], name: str) -> int:
     return sum(len({i for f in frames for i in getattr(f, name).tolist()})
                for frames in sequences)

@@ -5,18 +5,18 @@ from __future__ import annotations
 from rich.console import Console
 from rich.text import Text
 
-from lidar_perception.scoring.tables import narrow_table, print_skipped
+from lidar_perception.scoring.tables import make_table, print_skipped
 
 SHARES = {"HOTA": "HOTA", "DetA": "DetA", "AssA": "AssA", "MOTA": "MOTA", "sAMOTA": "sAMOTA"}
-EGO = {"recording": "the recording's poses", "kiss_icp": "poses by KISS-ICP",
-       "none": "no poses, so tracks are relative to the sensor"}
+EGO_TITLES = {"recording": "the recording's poses", "kiss_icp": "poses by KISS-ICP",
+              "none": "no poses, so tracks are relative to the sensor"}
 COUNTS = {"labels": "labels", "IDSW": "switches", "false": "false"}
 
 
 def print_tracking_report(content: dict, console: Console) -> None:
     """Scores by class in percent, and what they count."""
-    table = narrow_table(f"Tracking, {content['frames']} frames of {content['sequences']} "
-                         f"sequences, {EGO[content['ego']]}", "", *SHARES, *COUNTS, width=6)
+    table = make_table(f"Tracking, {content['frames']} frames of {content['sequences']} "
+                       f"sequences, {EGO_TITLES[content['ego']]}", "", *SHARES, *COUNTS, width=6)
     for name, row in content["classes"].items():
         if row is not None:
             table.add_row(name, *(f"{100 * row[key]:.1f}" for key in SHARES.values()),

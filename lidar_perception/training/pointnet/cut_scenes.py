@@ -22,8 +22,8 @@ from lidar_perception.detectors.pointpillars.detector import PointPillarsDetecto
 from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
 from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.segment import segment_ground
-from lidar_perception.scoring.points.clusters import UNKNOWN, labelled
-from lidar_perception.scoring.thinning import drawn
+from lidar_perception.scoring.points.clusters import UNKNOWN, label_clusters
+from lidar_perception.scoring.thinning import draw_subset
 from lidar_perception.training.augment import TrainingScene, raise_scene
 from lidar_perception.training.cache import cache_path, file_fingerprint, load_or_make
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, PointCloud
@@ -108,7 +108,7 @@ class CutScenes:
     def _cut(self, i: int) -> CutScene:
         scene, min_points, share = self.scenes.scene(i), self.min_points, self.draw_share(i)
         if share < 1:
-            left = drawn(len(scene.points), share, str(i))
+            left = draw_subset(len(scene.points), share, str(i))
             scene = replace(scene, points=scene.points[left])
             min_points = min(min_points, MIN_POINTS_LEFT)
         return cut_clusters(scene, self.config, min_points, self.proposer)
@@ -134,7 +134,7 @@ def cut_clusters(scene: TrainingScene, config: PointNetConfig, min_points: int,
     ground = segment_ground(frame, config.ground)
     clusters = clusters_of(frame, cluster_obstacles(frame.xyz, ground, config.clustering, sensed),
                            min_points, ground)
-    labels, owners = labelled(clusters, scene.boxes, scene.class_ids, config.classes)
+    labels, owners = label_clusters(clusters, scene.boxes, scene.class_ids, config.classes)
     unwanted = (owners >= 0) & ~np.append(scene.wanted, False)[owners]
     labels[unwanted], owners[unwanted] = UNKNOWN, -1
     boxes = np.zeros((len(clusters), 7))

@@ -31,7 +31,7 @@ from lidar_perception.detectors.pointnet.torch_network import TorchPointNet, out
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import show_progress
-from lidar_perception.scoring.detections import Detected
+from lidar_perception.scoring.detections import FrameDetections
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.augment import add_range_noise, vary_thing
 from lidar_perception.training.data import Batches, SceneReader, load_items
@@ -244,7 +244,7 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
         predictions.append(predict(TorchPointNet(network), scene.clusters))
         boxes = found(predictions[-1], config, [MIN_SCORE] * len(config.classes))
         boxes = restore_detections(boxes, SensorPoseParams(height=scene.height))
-        report.update(Detected(scene.name, scene.truth, boxes, scene.calibration))
+        report.update(FrameDetections(scene.name, scene.truth, boxes, scene.calibration))
     metrics, calibration = summarize_report(report, "bev", config.classes)
     known = (labels >= 0) & (sizes >= MIN_SCORED_POINTS)
     probabilities = np.concatenate([p.probabilities for p in predictions])[known]

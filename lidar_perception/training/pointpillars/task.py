@@ -46,7 +46,7 @@ from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.geometry import is_within
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import show_progress
-from lidar_perception.scoring.detections import Detected, detected
+from lidar_perception.scoring.detections import FrameDetections, run_detector
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.augment import (
@@ -260,12 +260,12 @@ def validate_detector(detector: Detector, scenes: SceneReader, jobs: int = 0) ->
     return report
 
 
-def detect_in_frame(frame: Frame, detector: Detector) -> Detected[Detections]:
+def detect_in_frame(frame: Frame, detector: Detector) -> FrameDetections[Detections]:
     """Run a detector on a loaded frame, at the height of its sensor."""
     height = frame.sensor_height
     if height != SENSOR_HEIGHT:
         detector = detector.with_sensor_height(height)
-    return detected(detector, frame, frame.truth(), frame.calibration())
+    return run_detector(detector, frame, frame.truth(), frame.calibration())
 
 
 def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batches,
