@@ -1,26 +1,25 @@
-// All that is asked of the server, and what it says by itself.
+// Requests to the server, and the events that it sends.
 
-import { hearLive, reopenLive } from "./live.js";
-import { applyEvent, changed, setState, store } from "./store.js";
 import { say, sayError } from "./messages.js";
+import { addLiveFrame, applyEvent, changed, setDrive, setState, store } from "./store.js";
 
 const TOKEN = new URLSearchParams(location.search).get("token");
 export const PAGE = crypto.randomUUID();
 const RETRY_MS = 1000;
-const SILENT_MS = 1500; // after this long without its event, an action's result is asked for
+const EVENT_TIMEOUT_MS = 1500; // without the event of an action for so long, the state is loaded
 
 function address(path) {
   return TOKEN === null ? path
     : `${path}${path.includes("?") ? "&" : "?"}token=${encodeURIComponent(TOKEN)}`;
 }
 
-/** A reply; an Error with a line for a person where there is none, or the server refuses. */
-async function ask(path, options) {
+/** Fetch a path; an Error with a line for the user if there is no reply, or the server refuses. */
+async function request(path, options) {
   let reply;
   try {
     reply = await fetch(address(path), { cache: "no-store", ...options });
   } catch {
-    throw new Error("the server cannot be reached; is it still running in its terminal?");
+    throw new Error("the server cannot be reached; check that it is still running");
   }
   if (reply.ok) return reply;
   const text = await reply.text();
@@ -29,29 +28,29 @@ async function ask(path, options) {
   throw Object.assign(new Error(line), { status: reply.status });
 }
 
-export const getJson = async (path) => (await ask(path)).json();
-export const getBytes = async (path, signal) => (await ask(path, { signal })).arrayBuffer();
+export const getJson = async (path) => (await request(path)).json();
+export const getBytes = async (path) => (await request(path)).arrayBuffer();
 
-const post = async (path, content) => (await ask(path, {
+const post = async (path, content) => (await request(path, {
   method: "POST",
   headers: { "Content-Type": "application/json", "X-Page": PAGE },
   body: JSON.stringify(content),
 })).json();
 
-let last = Promise.resolve(), unsaved = 0; // actions that were not answered yet
-addEventListener("beforeunload", (event) => { if (unsaved) event.preventDefault(); }); // asks
+let last = Promise.resolve(), unsaved = 0; // actions without a reply
+addEventListener("beforeunload", (event) => { if (unsaved) event.preventDefault(); }); // confirm
 
-/** Send an action after those before it. True once it is in the journal; else that is told, by a
- * message where not otherwise, and nothing has changed. */
-export function act(action, tell = sayError) {
+/** Send an action after the previous ones. True once it is in the journal; else report the error and
+ * return false, and nothing has changed. */
+export function act(action, reportError = sayError) {
   unsaved += 1;
   const sent = last.then(async () => {
     try {
       const { seq } = await post("/api/do", action);
-      await arrived(seq).catch(() => null); // it is saved; the state comes with the connection
+      await applied(seq).catch(() => null); // it is saved; the state comes with the connection
       return true;
     } catch (error) {
-      tell(`Not saved (${action.do.replace("_", " ")}): ${error.message}`);
+      reportError(`Not saved (${action.do.replace("_", " ")}): ${error.message}`);
       return false;
     } finally {
       unsaved -= 1;
@@ -61,9 +60,9 @@ export function act(action, tell = sayError) {
   return sent;
 }
 
-/** Until the event of this action has been applied; where it does not come, the whole state. */
-async function arrived(seq) {
-  const until = performance.now() + SILENT_MS;
+/** Wait until the event of an action has been applied; if it does not arrive, load the state. */
+async function applied(seq) {
+  const until = performance.now() + EVENT_TIMEOUT_MS;
   while (store.seq < seq && performance.now() < until) {
     await new Promise((resolve) => waiting.push(resolve) && setTimeout(resolve, 100));
   }
@@ -71,11 +70,15 @@ async function arrived(seq) {
 }
 let waiting = [];
 
+export async function loadDrive() {
+  setDrive(await getJson("/api/drive"));
+}
+
 export async function loadState() {
   setState(await getJson("/api/state"));
 }
 
-/** What was done before is in it too. */
+/** Export the labels, including all actions so far. */
 export const exportLabels = (content) => last.then(() => post("/api/export", content));
 
 export function nextUncertain(after, only) {
@@ -84,12 +87,12 @@ export function nextUncertain(after, only) {
 
 let socket = null;
 
-/** A word to the server that is no action. */
-export function tellServer(word) {
+/** Send "hold" or "go on" for a running graph. */
+export function sendToServer(word) {
   if (socket?.readyState === WebSocket.OPEN) socket.send(word);
 }
 
-/** Listen to what all pages do, for as long as the page is open. */
+/** Receive events for as long as the page is open. */
 export function listen() {
   const url = new URL(address("/api/events"), location.href);
   url.protocol = url.protocol.replace("http", "ws");
@@ -99,27 +102,33 @@ export function listen() {
     store.online = true;
     changed("connection");
     try {
-      await Promise.all([loadState(), back && store.drive.live ? reopenLive() : null]);
-      if (back) say("Connected again; all that was saved is here.");
+      const reload = back && store.drive.live;
+      await Promise.all([loadState(), reload ? loadDrive() : null]);
+      if (reload) changed("drive", "wanted", "status");
+      if (back) say("Connected again; all saved labels are up to date.");
     } catch (error) {
       sayError(error.message);
     }
   };
-  socket.onmessage = ({ data }) => hear(JSON.parse(data));
+  socket.onmessage = ({ data }) => receive(JSON.parse(data));
   socket.onclose = () => {
     store.online = false;
     changed("connection");
     setTimeout(listen, RETRY_MS);
-    fetch(address("/api/state")).then((reply) => { // why: a browser does not say it of a socket
+    fetch(address("/api/state")).then((reply) => { // a socket does not report the status
       store.refused = reply.status === 403;
       changed("connection");
     }, () => null);
   };
 }
 
-function hear(event) {
+function receive(event) {
   if (event.error) sayError(event.error);
-  if (event.live || event.status) hearLive(event);
+  if (event.status) {
+    store.status = event.status;
+    changed("status");
+  }
+  if (event.live) addLiveFrame(event.live);
   if (event.seq === undefined) {
     if (event.progress) {
       store.progress = event.progress;
@@ -127,16 +136,16 @@ function hear(event) {
     }
     return;
   }
-  if (event.seq <= store.seq) return; // the state that was loaded has it already
+  if (event.seq <= store.seq) return; // already in the loaded state
   if (event.seq === store.seq + 1) applyEvent(event);
-  else loadState().catch((error) => sayError(error.message)); // something was missed
+  else loadState().catch((error) => sayError(error.message)); // events were missed
   if (event.by && event.by !== PAGE && event.action) {
     say(`Another page: ${event.action.do.replace("_", " ")}`
       + (event.action.track ? ` of track ${event.action.track}` : ""));
   } else if (["propose", "import"].includes(event.action?.do) && event.tracks?.length) {
-    say(`${event.tracks.length} tracks ${event.action.do === "import" ? "imported" : "proposed or followed"}.`);
+    say(`${event.tracks.length} tracks ${event.action.do === "import" ? "imported" : "proposed or updated"}.`);
   }
-  const woken = waiting;
+  const waiters = waiting;
   waiting = [];
-  for (const wake of woken) wake();
+  for (const resume of waiters) resume();
 }

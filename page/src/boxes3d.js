@@ -10,7 +10,7 @@ import { resultBoxes } from "./results.js";
 import { draw, scene } from "./scene.js";
 import { on, store } from "./store.js";
 
-const TRAIL = 30; // frames of a track's way that are drawn
+const TRAIL = 30; // frames
 const SELECTED = { dark: [255, 255, 255], light: [17, 24, 39] };
 const FAINT = { proposed: 0.6, interpolated: 0.75, key: 1 };
 
@@ -37,7 +37,7 @@ function lines(linewidth) {
 const linear = new THREE.Color();
 const shade = ([r, g, b]) => linear.setRGB(r / 255, g / 255, b / 255, THREE.SRGBColorSpace).toArray();
 
-/** Towards the background, so that what is less sure stands back. */
+/** Blend a colour with the background; less certain boxes are fainter. */
 function faded(colour, share) {
   const back = theme() === "dark" ? 17 : 245;
   return colour.map((c) => back + (c - back) * share);
@@ -73,16 +73,16 @@ function setFronts(boxes) {
   fronts.geometry.setAttribute("color", new THREE.Float32BufferAttribute(colours, 3));
 }
 
-/** The places of a track's boxes up to now, in the frame shown; fixed places where there are
- * poses, else as the sensor saw them. */
+/** Positions of a track's last boxes in the coordinates of a frame; without poses, each in those of
+ * its own frame. */
 export function trailOf(track, frame = store.frame) {
-  if (track.trails) return track.trails[frame] ?? []; // as its tracker drew it
+  if (track.trails) return track.trails[frame] ?? []; // published by the tracker
   const { frames } = store.drive, here = frames[frame].pose, found = [];
   for (let i = Math.max(0, frame - TRAIL); i <= frame; i++) {
     const box = track.byFrame.get(i)?.box;
     if (!box) continue;
-    const there = frames[i].pose;
-    found.push(here && there ? intoPose(throughPose(box, there), here) : box.slice(0, 3));
+    const { pose } = frames[i];
+    found.push(here && pose ? intoPose(throughPose(box, pose), here) : box.slice(0, 3));
   }
   return found;
 }
@@ -91,11 +91,10 @@ function setTrails(boxes) {
   const at = [], colours = [];
   for (const { track, colour } of boxes) {
     if (!track) continue;
-    const way = trailOf(track);
-    for (let k = 1; k < way.length; k++) {
-      at.push(...way[k - 1], ...way[k]);
-      const share = k / way.length;
-      colours.push(...shade(faded(colour, 0.3 + 0.7 * (k - 1) / way.length)), ...shade(faded(colour, 0.3 + 0.7 * share)));
+    const trail = trailOf(track), fade = (k) => shade(faded(colour, 0.3 + 0.7 * k / trail.length));
+    for (let k = 1; k < trail.length; k++) {
+      at.push(...trail[k - 1], ...trail[k]);
+      colours.push(...fade(k - 1), ...fade(k));
     }
   }
   trails.geometry.dispose();

@@ -1,6 +1,6 @@
 // Boxes [x y z l w h yaw] (centre, metres, radians, z up) as plain arrays: pure functions.
 
-export const MIN_SIZE = 0.1; // metres; no face can be pushed through the one opposite
+const MIN_SIZE = 0.1; // metres
 
 export function wrap(angle) {
   return angle - 2 * Math.PI * Math.floor((angle + Math.PI) / (2 * Math.PI));
@@ -12,7 +12,7 @@ export function axisOf(box, axis) {
   return axis === 0 ? [c, s, 0] : axis === 1 ? [-s, c, 0] : [0, 0, 1];
 }
 
-/** One face moved outwards by delta metres; the face opposite stays where it is. */
+/** Move one face outwards by delta metres; the opposite face stays in place. */
 export function moveFace(box, axis, sign, delta) {
   const grown = Math.max(MIN_SIZE, box[3 + axis] + delta) - box[3 + axis];
   const direction = axisOf(box, axis), moved = box.slice();
@@ -27,7 +27,7 @@ export function moveBy(box, dx, dy, dz) {
   return moved;
 }
 
-/** Moved along its own length, width and height. */
+/** Move a box along its own axes. */
 export function moveAlong(box, forward, left, up) {
   const c = Math.cos(box[6]), s = Math.sin(box[6]);
   return moveBy(box, c * forward - s * left, s * forward + c * left, up);
@@ -39,7 +39,7 @@ export function turnBy(box, angle) {
   return turned;
 }
 
-/** The point in the axes of the box, from its centre. */
+/** Transform a point to the axes of the box, relative to its centre. */
 export function toLocal(box, x, y, z) {
   const c = Math.cos(box[6]), s = Math.sin(box[6]), dx = x - box[0], dy = y - box[1];
   return [c * dx + s * dy, -s * dx + c * dy, z - box[2]];
@@ -53,7 +53,7 @@ export function toWorld(box, u, v, w) {
 const SIGNS = [[1, 1, -1], [1, -1, -1], [-1, -1, -1], [-1, 1, -1],
                [1, 1, 1], [1, -1, 1], [-1, -1, 1], [-1, 1, 1]];
 
-/** Eight corners; the first two of each four are the front. */
+/** The eight corners, four of the bottom, then four of the top; the first two of each are the front. */
 export function corners(box) {
   return SIGNS.map(([a, b, c]) => toWorld(box, a * box[3] / 2, b * box[4] / 2, c * box[5] / 2));
 }
@@ -61,7 +61,7 @@ export function corners(box) {
 export const EDGES = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4],
                       [0, 4], [1, 5], [2, 6], [3, 7]];
 
-/** How far along the ray the box is met, or null. */
+/** The distance along a ray to a box, or null. */
 export function rayBox(origin, direction, box) {
   const o = toLocal(box, ...origin), c = Math.cos(box[6]), s = Math.sin(box[6]);
   const d = [c * direction[0] + s * direction[1], -s * direction[0] + c * direction[1],
@@ -75,7 +75,7 @@ export function rayBox(origin, direction, box) {
   return near <= far ? near : null;
 }
 
-/** Where on the line p + t a (unit a) the ray comes nearest to it; null where both are parallel. */
+/** The t of the point p + t a (unit a) that is nearest to a ray; null if they are parallel. */
 export function nearestOnLine(p, a, origin, direction) {
   const dot = (u, v) => u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
   const w = [p[0] - origin[0], p[1] - origin[1], p[2] - origin[2]];
@@ -83,14 +83,15 @@ export function nearestOnLine(p, a, origin, direction) {
   return under < 1e-4 * c ? null : (b * dot(direction, w) - c * dot(a, w)) / under;
 }
 
-/** Where the ray meets the level plane at height z, or null where it does not. */
+/** The intersection of a ray with the horizontal plane at height z, or null. */
 export function meetLevel(origin, direction, z) {
   const t = (z - origin[2]) / direction[2];
   return t > 0 && Number.isFinite(t)
     ? [origin[0] + t * direction[0], origin[1] + t * direction[1], z] : null;
 }
 
-/** A box through a pose (16 numbers, row by row, frame to fixed): moved and turned about z. */
+/** Transform a box by a pose (16 numbers, row by row, from frame to fixed frame); roll and pitch are
+ * ignored. */
 export function throughPose(box, pose) {
   const [x, y, z] = box, placed = box.slice();
   for (let k = 0; k < 3; k++) {
@@ -100,7 +101,7 @@ export function throughPose(box, pose) {
   return placed;
 }
 
-/** A fixed point (x, y, z) in the frame of a rigid pose. */
+/** Transform a point (x, y, z) of the fixed frame to the frame of a pose. */
 export function intoPose(point, pose) {
   const d = [point[0] - pose[3], point[1] - pose[7], point[2] - pose[11]];
   return [0, 1, 2].map((k) => pose[k] * d[0] + pose[4 + k] * d[1] + pose[8 + k] * d[2]);

@@ -1,26 +1,25 @@
-// Clouds: read, kept, fetched ahead.
+// Clouds: loading, caching, prefetching; and moving to another frame.
 
 import { getBytes } from "./api.js";
-import { commit } from "./edits.js";
 import { sayError } from "./messages.js";
 import { resultsOf } from "./results.js";
-import { changed, store } from "./store.js";
+import { changed, emit, store } from "./store.js";
 
-const KEPT = 12; // clouds of 114,000 points take 2 MB each
-const AHEAD = 3;
-const PATIENCE_MS = 120; // for results, so that they come with their cloud
+const MAX_CACHED = 12; // clouds of 114,000 points take 2 MB each
+const PREFETCHED = [1, -1, 2, 3]; // frames, relative to the one shown, in the direction of travel
+const MAX_WAIT_MS = 120; // for results, so that they appear with their cloud
 const EMPTY = { count: 0, xyz: new Float32Array(), intensity: new Uint8Array(),
                 ground: new Uint8Array(), cluster: new Uint32Array(), floor: -1.7 };
 
-const kept = new Map(); // frame -> promise of a cloud, the one used last at the end
+const cache = new Map(); // frame -> promise of a cloud, in order of last use
 
-/** A cloud as the server sends it: views of its bytes. */
+/** Make a cloud from the bytes of /api/cloud, without copying. */
 export function parse(buffer) {
   const magic = String.fromCharCode(...new Uint8Array(buffer, 0, 4));
-  if (magic !== "LPC1") throw new Error("the server sent something that is no cloud");
+  if (magic !== "LPC1") throw new Error("the server sent an invalid cloud");
   const count = new DataView(buffer).getUint32(4, true);
   const cluster = 4 * Math.ceil((8 + 14 * count) / 4);
-  if (buffer.byteLength < cluster + 4 * count) throw new Error("a cloud arrived cut");
+  if (buffer.byteLength < cluster + 4 * count) throw new Error("the cloud is incomplete");
   const cloud = {
     count,
     xyz: new Float32Array(buffer, 8, 3 * count),
@@ -31,7 +30,7 @@ export function parse(buffer) {
   return { ...cloud, floor: floorOf(cloud) };
 }
 
-/** Median height of the ground near the sensor; of all low points where none is marked. */
+/** Median height of the ground near the sensor, or a low percentile of all points without ground. */
 function floorOf({ xyz, ground, count }) {
   const heights = [];
   for (let i = 0; i < count && heights.length < 2000; i++) {
@@ -47,23 +46,23 @@ function floorOf({ xyz, ground, count }) {
 }
 
 export function cloudOf(frame) {
-  let cloud = kept.get(frame);
-  kept.delete(frame);
+  let cloud = cache.get(frame);
+  cache.delete(frame);
   if (!cloud) {
     cloud = getBytes(`/api/cloud/${frame}`).then(parse);
-    cloud.catch(() => kept.delete(frame));
+    cloud.catch(() => cache.delete(frame));
   }
-  kept.set(frame, cloud);
-  if (kept.size > KEPT) kept.delete(kept.keys().next().value);
+  cache.set(frame, cloud);
+  if (cache.size > MAX_CACHED) cache.delete(cache.keys().next().value);
   return cloud;
 }
 
-/** Show a frame as soon as its cloud is here; what was asked for last wins. */
+/** Show a frame once its cloud is loaded; the last request wins. Emits "leaving-frame" first. */
 export async function goTo(frame) {
   const last = store.drive.frames.length - 1;
   frame = Math.max(store.drive.first, Math.min(last, Math.round(frame)));
   if (frame === store.wanted && store.cloud) return;
-  commit(); // what a held key has moved is of the frame that is left
+  emit("leaving-frame");
   store.wanted = frame;
   changed("wanted");
   await show(frame);
@@ -72,7 +71,7 @@ export async function goTo(frame) {
 export async function show(frame) {
   let cloud = EMPTY;
   try {
-    if (frame >= 0) cloud = await cloudOf(frame); // -1: nothing has come yet
+    if (frame >= 0) cloud = await cloudOf(frame); // -1: nothing received yet
   } catch (error) {
     if (store.wanted === frame) {
       sayError(`Frame ${store.drive.frames[frame].name} has no cloud: ${error.message}`);
@@ -80,30 +79,28 @@ export async function show(frame) {
   }
   if (store.mode === "view" && frame >= 0) {
     await Promise.race([resultsOf(frame).catch(() => null),
-                        new Promise((resolve) => setTimeout(resolve, PATIENCE_MS))]);
+                        new Promise((resolve) => setTimeout(resolve, MAX_WAIT_MS))]);
   }
   if (store.wanted !== frame) return;
-  commit(); // what a key has moved meanwhile
+  emit("leaving-frame"); // a key may have moved a box meanwhile
   store.frame = frame;
   store.cloud = cloud;
   store.draft = null;
   changed("frame", "cloud", "draft");
-  ahead(frame);
+  prefetch(frame);
 }
 
-let direction = 1, before = 0;
+let direction = 1, previous = 0;
 
-function ahead(frame) {
-  if (store.playing && store.drive.live) return; // the next one has not come yet
-  if (frame !== before) direction = Math.sign(frame - before);
-  before = frame;
+/** Load the clouds around a frame, one after another so that the nearest arrives first. */
+async function prefetch(frame) {
+  if (store.playing && store.drive.live) return; // the next frame does not exist yet
+  if (frame !== previous) direction = Math.sign(frame - previous);
+  previous = frame;
   const frames = store.drive.frames.length;
-  const wished = [1, -1, 2, 3].slice(0, AHEAD + 1).map((k) => frame + k * direction);
-  (async () => { // one after another, so that the nearest is not held up by those behind it
-    for (const next of wished) {
-      if (next < store.drive.first || next >= frames || store.wanted !== frame) continue;
-      if (store.mode === "view") resultsOf(next).catch(() => null);
-      try { await cloudOf(next); } catch { /* said when it is shown */ }
-    }
-  })();
+  for (const next of PREFETCHED.map((k) => frame + k * direction)) {
+    if (next < store.drive.first || next >= frames || store.wanted !== frame) continue;
+    if (store.mode === "view") resultsOf(next).catch(() => null);
+    try { await cloudOf(next); } catch { /* reported when it is shown */ }
+  }
 }

@@ -23,7 +23,7 @@ export function theme() {
   return matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark";
 }
 
-/** A colour as four bytes of an array of colours. */
+/** A colour as a 32-bit number. */
 const packed = ([r, g, b]) => (r | g << 8 | b << 16) >>> 0;
 
 function ramp(stops, steps = 256) {
@@ -36,7 +36,7 @@ function ramp(stops, steps = 256) {
 }
 const TABLES = { dark: ramp(RAMPS.dark), light: ramp(RAMPS.light) };
 
-/** Any hue for a number, the same each time. */
+/** A colour for a number, always the same. */
 function hue(number, which) {
   const h = number * 0.61803398875 % 1, light = which === "dark" ? 0.66 : 0.4;
   return packed([0, 8, 4].map((n) => {
@@ -46,13 +46,13 @@ function hue(number, which) {
 }
 
 export function colourOfClass(name) {
-  const colour = classOf(name)?.color ?? "#9b8afb"; // a class that nobody here knows
+  const colour = classOf(name)?.color ?? "#9b8afb"; // an unknown class
   const parts = rgb(colour), bright = 0.3 * parts[0] + 0.59 * parts[1] + 0.11 * parts[2];
   if (theme() === "dark" || bright < BRIGHT) return colour;
   return `#${parts.map((c) => Math.round(c * BRIGHT / bright).toString(16).padStart(2, "0")).join("")}`;
 }
 
-/** Fill colours, four bytes a point, for a cloud. */
+/** Fill `bytes` with the colours of a cloud, four bytes per point. */
 export function paint(bytes, cloud, how) {
   const colours = new Uint32Array(bytes.buffer), which = theme();
   const { count, xyz, intensity, ground, cluster, floor } = cloud, table = TABLES[which];
@@ -91,7 +91,8 @@ function paintClasses(colours, { xyz, count }) {
   }
 }
 
-/** The boxes of tracks in the frame shown that are not rejected: {track, box, kind, colour}. */
+/** Boxes of tracks in the frame shown, without rejected ones unless selected: {track, box, kind,
+ * colour}. */
 export function shownBoxes() {
   const found = [];
   for (const track of store.tracks.values()) {

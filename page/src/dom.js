@@ -1,11 +1,11 @@
-// Making elements, in one line each.
+// Helpers that create HTML and SVG elements.
 
 const SVG = "http://www.w3.org/2000/svg";
 
 function fill(node, attributes, children) {
   for (const [name, value] of Object.entries(attributes)) {
     if (name.startsWith("on")) node[name] = value;
-    else if (name === "style") node.style.cssText = value; // an attribute would need another policy
+    else if (name === "style") node.style.cssText = value; // the Content-Security-Policy forbids the attribute
     else if (value === true) node.setAttribute(name, "");
     else if (value !== false && value !== null && value !== undefined) {
       node.setAttribute(name, value);
@@ -23,7 +23,7 @@ export function svg(name, attributes = {}, ...children) {
   return fill(document.createElementNS(SVG, name), attributes, children);
 }
 
-// Strokes on a field of 24 by 24.
+// Icon paths, in a 24 by 24 viewBox.
 const PATHS = {
   close: "M6 6l12 12M18 6L6 18",
   undo: "M9 14L4 9l5-5M4 9h10a6 6 0 0 1 0 12h-3",

@@ -1,13 +1,13 @@
-// What a person can do to tracks: each becomes one action. A box that is dragged, or moved by a
-// held key, is a draft until it is let go.
+// Edits of tracks; each becomes one action. A box that is dragged, or moved by a held key, is a draft
+// until it is released.
 
 import { act, nextUncertain } from "./api.js";
 import { moveAlong, turnBy } from "./boxmath.js";
 import { cloudOf, goTo } from "./cloud.js";
 import { say, sayError } from "./messages.js";
-import { boxOf, changed, classOf, select, selectedBox, selectedTrack, store } from "./store.js";
+import { boxOf, changed, classOf, on, select, selectedBox, selectedTrack, store } from "./store.js";
 
-export const STEP = 0.05, TURN = Math.PI / 180; // metres, radians, of one arrow key
+const STEP = 0.05, TURN = Math.PI / 180; // of one arrow key: metres, radians
 
 const editable = () => store.mode === "label";
 
@@ -30,7 +30,7 @@ export function dropDraft() {
   changed("draft");
 }
 
-/** Send what was dragged. Where it cannot be saved, the box goes back. */
+/** Save the draft. If that fails, the box moves back. */
 export async function commit() {
   const { draft } = store;
   if (!draft || draft.sent) return;
@@ -39,7 +39,9 @@ export async function commit() {
   if (store.draft === draft) dropDraft();
 }
 
-/** A fine step of the selected box along its own axes, or a turn; commit() when the key is up. */
+on("leaving-frame", commit); // the draft belongs to the frame that is left
+
+/** Move the selected box a step along its own axes, or turn it; commit() on key up. */
 export function nudge({ forward = 0, left = 0, up = 0, turn = 0 }) {
   const box = selectedBox()?.box;
   if (box) setDraft(turnBy(moveAlong(box, forward * STEP, left * STEP, up * STEP), turn * TURN));
@@ -50,8 +52,8 @@ async function onTrack(action) {
   return track ? act({ ...action, track: track.id }) : false;
 }
 
-/** accept, reject or reopen what is selected, and then on to the next uncertain one, where that is
- * wanted; else what is pointed at. */
+/** "accept", "reject" or "reopen" the selected track and go to the next uncertain one, unless the
+ * user has disabled that; without a selection, decide on the track under the pointer. */
 export async function decide(verb) {
   if (!editable()) return;
   const pointed = selectedTrack() ? null : store.tracks.get(store.hover);
@@ -64,42 +66,42 @@ export async function next() {
   try {
     const { track, frame } = await nextUncertain(store.selected, store.only);
     if (track === null) {
-      say("Nothing is left to decide.");
+      say("All tracks are decided.");
       return;
     }
     if (!store.tracks.get(track)?.byFrame.has(store.frame)) await goTo(frame);
     select(track);
     changed("focus");
-    const then = await nextUncertain(track, store.only); // while this one is looked at
-    if (then.track !== null) cloudOf(then.frame).catch(() => null); // said when it is shown
+    const then = await nextUncertain(track, store.only); // prefetch
+    if (then.track !== null) cloudOf(then.frame).catch(() => null); // reported when it is shown
   } catch (error) {
     sayError(error.message);
   }
 }
 
-/** Of the selected track; while a seed or a place is looked for, or nothing is selected, of new
- * ones. */
+/** Set the class of the selected track; with another tool or without a selection, the class of new
+ * tracks. */
 export function setClass(name) {
   if (store.tool === "select" && selectedTrack()) return setTrackClass(name);
   store.newClass = name;
-  if (store.tool === "select") say(`New boxes and seeds are now of class ${name}.`);
+  if (store.tool === "select") say(`New boxes and seeds get the class ${name}.`);
   changed("tool");
   return null;
 }
 
 export const setTrackClass = (name) => onTrack({ do: "class", class: name });
 
-/** All that is left in the list, of the class that it shows or of all: one action. */
+/** Reject all undecided tracks of the listed class, or of all classes, as one action. */
 export async function rejectRest() {
   if (!editable()) return;
   const { only } = store, count = leftIn(only);
-  if (count === 0) say("Nothing is left to reject.");
+  if (count === 0) say("There are no undecided tracks.");
   else if (await act({ do: "reject_rest", ...(only ? { class: only } : {}) })) {
-    say(`${count} rejected. Ctrl Z takes it back.`);
+    say(`${count} tracks rejected. Ctrl+Z undoes it.`);
   }
 }
 
-/** How many tracks of a class, null for all, are left to decide. */
+/** Number of undecided tracks of a class, null for all. */
 export const leftIn = (only) => [...store.tracks.values()].filter((track) =>
   track.state === "proposed" && (!only || track.class === only)).length;
 
@@ -108,18 +110,18 @@ export const classToAdd = () => store.newClass
 
 export const snap = (to) => onTrack({ do: "snap", frame: store.frame, to });
 export const removeBox = () => onTrack({ do: "remove_box", frame: store.frame });
-/** No boxes "before" or "after" this frame. */
+/** Remove the boxes "before" or "after" this frame. */
 export const trim = (side) => onTrack({ do: "trim", frame: store.frame, side });
 export const split = () => onTrack({ do: "split", frame: store.frame });
 
-/** This frame's box of the selected track also in the next frame; then go there. */
+/** Copy this frame's box of the selected track to the next frame, and go there. */
 export async function copyOn() {
   const track = chosen(), from = store.frame;
   if (!track || from + 1 >= store.drive.frames.length) return;
   if (await act({ do: "copy", track: track.id, from, to: from + 1 })) await goTo(from + 1);
 }
 
-/** Give this frame's box back to the interpolation between the boxes before and after it. */
+/** Interpolate this frame's box between the key boxes before and after it. */
 export async function interpolate() {
   const track = chosen();
   if (!track) return;
@@ -128,7 +130,7 @@ export async function interpolate() {
   const before = Math.max(...frames.filter((frame) => frame < store.frame));
   const after = Math.min(...frames.filter((frame) => frame > store.frame));
   if (!Number.isFinite(before) || !Number.isFinite(after)) {
-    say("Interpolating needs a box set by hand before this frame and one after it.");
+    say("Interpolation needs a box set by hand before this frame and one after it.");
     return;
   }
   await act({ do: "interpolate", track: track.id, frame: store.frame });
@@ -138,7 +140,7 @@ export async function merge() {
   const track = chosen();
   if (!track) return;
   if (store.also.size === 0) {
-    say("Select a second track with Ctrl and a click, then merge.");
+    say("Select a second track with Ctrl+click, then merge.");
     return;
   }
   for (const other of [...store.also]) {
@@ -168,7 +170,7 @@ function selectNew(before) {
 
 export async function checkFrame() {
   const { frame } = store, now = !store.checked.has(frame);
-  if (!editable() || store.wanted !== frame) return; // another one is on its way: not this one twice
+  if (!editable() || store.wanted !== frame) return; // another frame is loading: do not toggle twice
   const done = await act({ do: "check", frame, checked: now });
   if (done && now && store.wanted === frame) await goTo(frame + 1);
 }
@@ -177,7 +179,7 @@ export const undo = () => editable() && (store.canUndo ? act({ do: "undo" }) : s
 export const redo = () => editable() && (store.canRedo ? act({ do: "redo" }) : say("Nothing to redo."));
 export const propose = () => act({ do: "propose" });
 
-/** The next or the last frame in which the selected track has a box set by hand. */
+/** Go to the next (1) or previous (-1) frame in which the selected track has a key box. */
 export function toKey(step) {
   const track = selectedTrack();
   if (!track) return;

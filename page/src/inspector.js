@@ -1,4 +1,4 @@
-// The selected track: its class, its numbers, what can be done to it, the silhouettes.
+// The selected track: class, numbers, actions, silhouettes.
 
 import { getJson } from "./api.js";
 import { colourOfClass } from "./colours.js";
@@ -13,19 +13,19 @@ const KINDS = { key: "set by hand", proposed: "proposed", interpolated: "interpo
 const panel = document.getElementById("inspector");
 const nothing = document.getElementById("nothing-selected");
 const number = (name) => document.getElementById(`field-${name}`);
-let typed = null; // the field in which something stands that was not taken yet
+let typed = null; // the field with unsaved input
 
 const BUTTONS = [
-  ["Snap", [["cluster", "C", "To the L-shape of its cluster", () => snap("cluster")],
-            ["ground", "G", "Down to the ground", () => snap("ground")],
-            ["size", "T", "To the size of the track", () => snap("size")]]],
+  ["Snap", [["cluster", "C", "Snap to the L-shape of its cluster", () => snap("cluster")],
+            ["ground", "G", "Snap to the ground", () => snap("ground")],
+            ["size", "T", "Snap to the size of the track", () => snap("size")]]],
   ["Box", [["copy", "V", "Copy to the next frame, and go there", copyOn],
-           ["interpolate", "I", "Between the boxes set by hand before and after", interpolate],
+           ["interpolate", "I", "Interpolate between the boxes set by hand before and after", interpolate],
            ["remove", "Del", "Remove the box of this frame", removeBox]]],
-  ["Track", [["merge", "M", "Merge with the tracks selected by Ctrl and a click", merge],
-             ["split", "X", "This frame and those after it become a new track", split],
-             ["begin", "Q", "Begins here: no boxes before this frame", () => trim("before")],
-             ["end", "E", "Ends here: no boxes after this frame", () => trim("after")]]],
+  ["Track", [["merge", "M", "Merge with the tracks selected by Ctrl+click", merge],
+             ["split", "X", "Split: this frame and later ones become a new track", split],
+             ["begin", "Q", "The track starts here: remove boxes before this frame", () => trim("before")],
+             ["end", "E", "The track ends here: remove boxes after this frame", () => trim("after")]]],
 ];
 
 export function openInspector() {
@@ -33,11 +33,11 @@ export function openInspector() {
   for (const [k, [name, unit]] of FIELDS.entries()) {
     const input = element("input", { id: `field-${name}`, type: "number", inputmode: "decimal",
       step: unit === "m" ? 0.05 : 1, oninput: () => { typed = input; },
-      onchange: () => takeNumber(k, input),
-      onkeydown: ({ key }) => { if (key === "Escape") giveUp(); } });
+      onchange: () => saveNumber(k, input),
+      onkeydown: ({ key }) => { if (key === "Escape") discardInput(); } });
     fields.append(element("label", {}, element("span", {}, name), input, element("i", {}, unit)));
   }
-  // What was typed is of the track and the frame that are left by this click, so it is taken first.
+  // A click may select another track or frame, so save the input first.
   addEventListener("pointerdown", ({ target }) => {
     const typing = document.activeElement;
     if (fields.contains(typing) && target !== typing) typing.blur();
@@ -52,14 +52,14 @@ export function openInspector() {
   const choice = document.getElementById("class");
   choice.onchange = async () => {
     await setTrackClass(choice.value);
-    fill(); // what could not be saved is not shown
+    fill(); // show the saved class if saving failed
   };
   document.getElementById("accept").onclick = () => decide(pressed("accepted", "accept"));
   document.getElementById("reject").onclick = () => decide(pressed("rejected", "reject"));
   on("drive", fillClasses);
   on("selection tracks draft drive", fill);
-  on("frame", giveUp); // of another frame it would be another box's
-  on("selection tracks frame", askSilhouettes);
+  on("frame", discardInput); // it belongs to the box of the previous frame
+  on("selection tracks frame", loadSilhouettes);
 }
 
 const pressed = (state, verb) => selectedTrack()?.state === state ? "reopen" : verb;
@@ -69,19 +69,19 @@ function fillClasses() {
     element("option", { value: name }, k < 9 ? `${k + 1}  ${name}` : name)));
 }
 
-/** The number that was typed; all others stay as they are, of which the fields show rounded ones. */
-async function takeNumber(k, input) {
+/** Save one number of the box; the others keep the digits that the fields do not show. */
+async function saveNumber(k, input) {
   typed = null;
-  const box = selectedBox()?.box.slice(), value = input.valueAsNumber; // NaN where nothing is left
+  const box = selectedBox()?.box.slice(), value = input.valueAsNumber; // NaN if empty
   if (box && Number.isFinite(value) && (value > 0 || k < 3 || k === 6)) {
     box[k] = k === 6 ? value * Math.PI / 180 : value;
-    setDraft(box); // so that the number that is typed next goes with this one
+    setDraft(box); // so that the next number is added to this one
     await commit();
   }
   fill();
 }
 
-function giveUp() {
+function discardInput() {
   typed = null;
   fill();
 }
@@ -123,7 +123,7 @@ function fillNumbers(box) {
   }
 }
 
-/** A label or a detection that is looked at. */
+/** Show a selected label or detection. */
 function fillFound({ layer, row, wrong, colour }) {
   document.getElementById("who").textContent = row[7];
   const badge = document.getElementById("state");
@@ -134,27 +134,27 @@ function fillFound({ layer, row, wrong, colour }) {
   fillNumbers(row);
 }
 
-/** What is known of it besides its box: [name, value]. */
+/** Further facts about a track, label or detection: [name, value]. */
 function factsOf(track, found) {
   if (track) {
     return [["source", track.source], ["score", track.score.toFixed(2)],
             ["frames", `${track.byFrame.size}, from ${track.first} to ${track.last}`]];
   }
   const { layer, row } = found, facts = [];
-  facts.push(["away", `${Math.hypot(row[0], row[1]).toFixed(1)} m`]);
+  facts.push(["distance", `${Math.hypot(row[0], row[1]).toFixed(1)} m`]);
   if (layer === "labels") {
     if (row[8] !== null && row[8] !== undefined) facts.push(["track", `${row[8]}`]);
     return facts;
   }
   facts.unshift(["source", layer], ["score", row[8].toFixed(3)]);
   for (const [name, said] of Object.entries(row[9] ?? {})) facts.push([name, said.toFixed(3)]);
-  const id = trackThere(row);
+  const id = trackAt(row);
   if (id !== null) facts.push(["track", `${id}`]);
   return facts;
 }
 
-/** The id of the track of that class whose box is there too, or null. */
-function trackThere(row) {
+/** The id of the track of the same class at a detection, or null. */
+function trackAt(row) {
   let best = null, least = Math.max(1, row[3] / 2);
   for (const track of store.tracks.values()) {
     const box = track.byFrame.get(store.frame)?.box;
@@ -164,21 +164,21 @@ function trackThere(row) {
   return best;
 }
 
-let asked = "", waiting = 0;
+let requested = "", waiting = 0;
 
-function askSilhouettes() {
+function loadSilhouettes() {
   const track = selectedTrack(), area = document.getElementById("silhouettes");
   const key = track && store.seeds.length && selectedBox() && !store.playing ? `${store.frame} ${track.id} ${selectedBox().box}` : "";
-  if (key === asked || store.mode === "view") return;
-  asked = key;
+  if (key === requested || store.mode === "view") return;
+  requested = key;
   clearTimeout(waiting);
   if (!key) { area.hidden = true; return; }
   waiting = setTimeout(async () => {
     let found = null;
     try {
       found = await getJson(`/api/silhouettes?frame=${store.frame}&track=${track.id}`);
-    } catch { /* no seed yet, or nothing to compare: there is nothing to show */ }
-    if (asked !== key) return;
+    } catch { /* no seed yet, or nothing to compare */ }
+    if (requested !== key) return;
     area.hidden = found === null;
     if (found === null) return;
     drawSilhouette("seed", found.seed);

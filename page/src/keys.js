@@ -1,4 +1,4 @@
-// Every key, in one table: what it does, and the help that lists them.
+// All keys in one table, which also makes the help.
 
 import { element } from "./dom.js";
 import { checkFrame, commit, copyOn, decide, dropDraft, interpolate, merge, next, nudge, propose,
@@ -6,7 +6,7 @@ import { checkFrame, commit, copyOn, decide, dropDraft, interpolate, merge, next
          undo } from "./edits.js";
 import { step, to, togglePlay } from "./playback.js";
 import { setTool, useCentre } from "./pointer.js";
-import { nextWrong } from "./results.js";
+import { nextWrong } from "./resultpanel.js";
 import { fly, focus, resetView, topView } from "./scene.js";
 import { changed, select, selectedBox, store } from "./store.js";
 
@@ -23,7 +23,7 @@ export function setColour(how) {
 const nextColour = () => setColour(COLOURS[(COLOURS.indexOf(store.colour) + 1) % COLOURS.length]);
 const toggleNames = () => { store.names = !store.names; changed("tracks"); };
 
-/** The box where one is selected; else, and while a place is looked for, the camera. */
+/** Move the selected box; without one, or with another tool, the camera. */
 const arrow = (box, camera) => () => {
   if (selectedBox() && store.mode === "label" && store.tool === "select") nudge(box);
   else camera();
@@ -31,20 +31,20 @@ const arrow = (box, camera) => () => {
 
 // section, keys as the browser names them (with "Ctrl+" and "Shift+"), keys as shown, what, run
 const TABLE = [
-  ["Decide", "a", "A", "Accept what is selected, or pointed at; on to the next", () => decide("accept"), LABEL],
-  ["Decide", "r", "R", "Reject it; on to the next uncertain one", () => decide("reject"), LABEL],
-  ["Decide", "Shift+r", "Shift R", "Reject all that are left in the list", rejectRest, LABEL],
+  ["Decide", "a", "A", "Accept the track that is selected or under the pointer; go to the next", () => decide("accept"), LABEL],
+  ["Decide", "r", "R", "Reject it; go to the next uncertain one", () => decide("reject"), LABEL],
+  ["Decide", "Shift+r", "Shift R", "Reject all undecided tracks in the list", rejectRest, LABEL],
   ["Decide", "n", "N", "Next uncertain track", next, LABEL],
-  ["Decide", "u", "U", "Open a decided track again", () => decide("reopen"), LABEL],
-  ["Decide", "k", "K", "This frame is checked; on to the next", checkFrame, LABEL],
-  ["Decide", "p", "P", "Let the detectors propose tracks", propose, LABEL],
+  ["Decide", "u", "U", "Reopen a decided track", () => decide("reopen"), LABEL],
+  ["Decide", "k", "K", "Mark this frame as checked; go to the next", checkFrame, LABEL],
+  ["Decide", "p", "P", "Propose tracks with the detectors", propose, LABEL],
   ["Decide", "Ctrl+z", "Ctrl Z", "Undo", undo, LABEL],
   ["Decide", "Ctrl+y Ctrl+Shift+z", "Ctrl Y", "Redo", redo, LABEL],
-  ["Tools", "s", "S", "Seed: click an object of the class", () => setTool("seed"), LABEL],
-  ["Tools", "b", "B", "Box: click where a new one stands", () => setTool("add"), LABEL],
-  ["Tools", "Enter", "Enter", "What is in the middle of the view: select, seed, or add", useCentre, BOTH],
-  ["Tools", "Escape", "Esc", "Back to selecting; nothing selected", escape, BOTH],
-  ["Tools", "1 2 3 4 5 6 7 8 9", "1 – 9", "Class, of what is selected or of new ones", null, LABEL],
+  ["Tools", "s", "S", "Seed: click an object; similar ones are proposed", () => setTool("seed"), LABEL],
+  ["Tools", "b", "B", "Box: click where to place a new one", () => setTool("add"), LABEL],
+  ["Tools", "Enter", "Enter", "Click in the middle of the view: select, seed or add", useCentre, BOTH],
+  ["Tools", "Escape", "Esc", "Back to selecting; clear the selection", escape, BOTH],
+  ["Tools", "1 2 3 4 5 6 7 8 9", "1 – 9", "Class of the selected track or of new ones", null, LABEL],
   ["Box", "ArrowUp", "↑", "Forward by 5 cm", arrow({ forward: 1 }, () => fly(0, 0.04)), BOTH],
   ["Box", "ArrowDown", "↓", "Back by 5 cm", arrow({ forward: -1 }, () => fly(0, -0.04)), BOTH],
   ["Box", "ArrowLeft", "←", "Left by 5 cm", arrow({ left: 1 }, () => fly(-0.04, 0)), BOTH],
@@ -61,22 +61,22 @@ const TABLE = [
   ["Track", "Delete", "Del", "Remove the box of this frame", removeBox, LABEL],
   ["Track", "m", "M", "Merge the selected tracks", merge, LABEL],
   ["Track", "x", "X", "Split here", split, LABEL],
-  ["Track", "q", "Q", "Begins here: no boxes before", () => trim("before"), LABEL],
-  ["Track", "e", "E", "Ends here: no boxes after", () => trim("after"), LABEL],
-  ["Track", "[", "[", "Box set by hand before this frame", () => toKey(-1), LABEL],
-  ["Track", "]", "]", "Box set by hand after this frame", () => toKey(1), LABEL],
+  ["Track", "q", "Q", "Starts here: remove boxes before", () => trim("before"), LABEL],
+  ["Track", "e", "E", "Ends here: remove boxes after", () => trim("after"), LABEL],
+  ["Track", "[", "[", "Previous box set by hand", () => toKey(-1), LABEL],
+  ["Track", "]", "]", "Next box set by hand", () => toKey(1), LABEL],
   ["Frames", ", PageUp", ",", "Previous frame", () => step(-1), BOTH],
   ["Frames", ". PageDown", ".", "Next frame", () => step(1), BOTH],
   ["Frames", "Home", "Home", "First frame", () => to(store.drive.first), BOTH],
   ["Frames", "End", "End", "Last frame", () => to(store.drive.frames.length - 1), BOTH],
   ["Frames", "Space", "Space", "Play, stop", togglePlay, BOTH],
-  ["Errors", "n ]", "N", "Next one that was missed or is false", () => nextWrong(1), VIEW],
-  ["Errors", "[", "[", "The last one before", () => nextWrong(-1), VIEW],
-  ["View", "f", "F", "Look at the selected box", focus, BOTH],
-  ["View", "o", "O", "From above", topView, BOTH],
-  ["View", "0", "0", "The view at the beginning", resetView, BOTH],
-  ["View", "h", "H", "Next colouring", nextColour, BOTH],
-  ["View", "l", "L", "Names of boxes on, off", toggleNames, BOTH],
+  ["Errors", "n ]", "N", "Next missed label or false detection", () => nextWrong(1), VIEW],
+  ["Errors", "[", "[", "Previous missed label or false detection", () => nextWrong(-1), VIEW],
+  ["View", "f", "F", "Zoom in on the selected box", focus, BOTH],
+  ["View", "o", "O", "View from above", topView, BOTH],
+  ["View", "0", "0", "Initial view", resetView, BOTH],
+  ["View", "h", "H", "Next colour scheme", nextColour, BOTH],
+  ["View", "l", "L", "Show or hide names of boxes", toggleNames, BOTH],
   ["View", "?", "?", "These keys", showHelp, BOTH],
 ];
 
@@ -99,8 +99,8 @@ function nameOf(event) {
   return `${event.ctrlKey || event.metaKey ? "Ctrl+" : ""}${shift}${key}`;
 }
 
-/** Keys that the focused element needs itself. */
-function taken(event) {
+/** True for keys that the focused element uses itself. */
+function isUsedByElement(event) {
   const { target } = event;
   if (document.querySelector("dialog[open]")) return true;
   if (target.matches?.("input[type=range]")) return HELD.has(event.key) || /^(Home|End|Page)/.test(event.key);
@@ -109,13 +109,13 @@ function taken(event) {
 }
 
 function press(event) {
-  if (taken(event) || event.altKey || !store.drive) return;
-  const name = nameOf(event), asked = `${store.mode} ${name}`;
-  if (!runs.has(asked)) return;
+  if (isUsedByElement(event) || event.altKey || !store.drive) return;
+  const name = nameOf(event), modeAndKey = `${store.mode} ${name}`;
+  if (!runs.has(modeAndKey)) return;
   event.preventDefault();
   if (event.target.matches?.("input, select")) event.target.blur();
   if (event.repeat && !HELD.has(event.key) && !/^[.,]$|^Page/.test(event.key)) return;
-  const run = runs.get(asked), entry = store.drive.classes[Number(name) - 1];
+  const run = runs.get(modeAndKey), entry = store.drive.classes[Number(name) - 1];
   if (run) run();
   else if (entry) setClass(entry.name);
 }
@@ -129,14 +129,14 @@ export function openKeys() {
   addEventListener("keydown", press);
   addEventListener("keyup", (event) => { if (HELD.has(event.key)) commit(); });
   addEventListener("blur", () => commit());
-  // After a click by mouse the keys are the page's again: Space plays, and presses no button twice.
+  // A button loses focus after a mouse click, so that Space plays instead of pressing it again.
   addEventListener("click", ({ detail, target }) => { if (detail) target.closest?.("button")?.blur(); });
-  // So after a choice by mouse, or an arrow that is to move the box would change its class.
+  // So does a list after a choice by mouse, so that arrow keys move the box instead of the choice.
   addEventListener("pointerdown", ({ target }) => { pointed = target; }, { capture: true });
   addEventListener("change", ({ target }) => { if (target === pointed && target.matches("select")) target.blur(); });
 }
 
-/** Fill the help, for label or view mode. */
+/** Fill the help with the keys of the mode. */
 export function listKeys() {
   const sections = new Map();
   for (const [section, , keys, what, , where] of TABLE) {

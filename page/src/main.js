@@ -1,12 +1,12 @@
-// The page: its parts are opened in order, then the drive is asked for.
+// Entry point: opens the parts of the page in order, then loads the drive.
 
-import { getJson, listen, loadState } from "./api.js";
+import { listen, loadDrive, loadState } from "./api.js";
 import "./boxes3d.js";
 import { show } from "./cloud.js";
 import { leftIn } from "./edits.js";
 import { openInspector } from "./inspector.js";
 import { listKeys, openKeys } from "./keys.js";
-import { openLive, takeDrive } from "./live.js";
+import { openLive } from "./live.js";
 import { sayError } from "./messages.js";
 import { loadResults } from "./results.js";
 import { openResults } from "./resultpanel.js";
@@ -29,7 +29,7 @@ async function open() {
   openKeys();
   on("focus", focus);
   try {
-    takeDrive(await getJson("/api/drive"));
+    await loadDrive();
     store.mode = store.drive.mode;
     store.minScore = store.drive.min_score;
     if (store.mode === "view") store.filter = "all";
@@ -38,23 +38,23 @@ async function open() {
     await loadState();
     if (store.mode === "label" && store.tracks.size && leftIn(null) === 0) store.filter = "all";
   } catch (error) {
-    sayError(`The drive cannot be opened: ${error.message}`);
+    sayError(`Cannot open the drive: ${error.message}`);
     return;
   }
   listen();
-  const asked = new URLSearchParams(location.search);
+  const query = new URLSearchParams(location.search);
   const last = store.drive.frames.length - 1;
-  store.wanted = store.drive.live ? last : Math.min(last, Math.max(0, Number(asked.get("frame")) || 0));
+  store.wanted = store.drive.live ? last : Math.min(last, Math.max(0, Number(query.get("frame")) || 0));
   await show(store.wanted);
   openLive();
-  if (asked.has("track")) select(Number(asked.get("track")));
+  if (query.has("track")) select(Number(query.get("track")));
   await loadResults();
-  changed("tracks"); // one more picture, now that all is here
+  changed("tracks"); // redraw, now that everything is loaded
   requestAnimationFrame(() => requestAnimationFrame(() => {
     document.documentElement.dataset.ready = "true";
   }));
 }
 
-// For measurements and for pictures from a script; nothing on the page uses it.
+// For measurements, screenshots and tests; the page itself does not use it.
 globalThis.page = { store, draw, drawn, pointAt, project, fly, limits, lookAt };
 open();

@@ -1,4 +1,4 @@
-// Short messages at the edge of the picture, and all of them in a log.
+// Short messages at the edge of the view, and the log of all messages.
 
 import { element, icon } from "./dom.js";
 
@@ -28,6 +28,6 @@ export function showLog() {
   const list = dialog.querySelector("ol");
   list.replaceChildren(...log.toReversed().map(({ time, text, kind }) =>
     element("li", { class: kind }, element("time", {}, time.toLocaleTimeString()), text)));
-  if (log.length === 0) list.append(element("li", {}, "Nothing so far."));
+  if (log.length === 0) list.append(element("li", {}, "No messages yet."));
   dialog.showModal();
 }

@@ -1,4 +1,4 @@
-// What is laid over the 3D view: handles of the selected box, names of boxes.
+// Overlay of the 3D view: handles of the selected box, names of boxes.
 
 import { axisOf, meetLevel, moveBy, moveFace, nearestOnLine, toWorld, turnBy } from "./boxmath.js";
 import { colourOfClass, shownBoxes } from "./colours.js";
@@ -15,15 +15,15 @@ const FACES = [["+x", "front"], ["-x", "back"], ["+y", "left side"], ["-y", "rig
                ["+z", "top"], ["-z", "bottom"]];
 const AXES = { x: 0, y: 1, z: 2 };
 
-export const STILL = 4; // pixels; less is a click, more drags or turns the camera
-const SMALL = 34; // pixels: handles of a box that looks smaller would hide it
+export const CLICK_RADIUS = 4; // pixels; a longer movement is a drag
+const SMALL = 34; // pixels; the handles would hide a smaller box
 const ring = svg("path", { class: "ring" });
 const grip = svg("path", { class: "ringgrip", "data-handle": "yaw" }, svg("title", {}, "Drag to turn"));
 const stalk = svg("path", { class: "stalk" });
 const knob = svg("circle", { class: "handle turn", r: 7, "data-handle": "yaw" },
   svg("title", {}, "Drag to turn"));
 const faces = FACES.map(([name, what]) => svg("circle", { class: "handle face", r: 6,
-  "data-handle": name }, svg("title", {}, `Drag to move the ${what} alone`)));
+  "data-handle": name }, svg("title", {}, `Drag to move only the ${what}`)));
 layer.append(ring, grip, stalk, ...faces, knob);
 
 const away = (box) => Math.hypot(box[3], box[4]) / 2 + 0.35;
@@ -39,7 +39,7 @@ function place(handle, at) {
 
 const handled = () => store.mode === "label" && store.tool === "select" ? selectedBox()?.box : null;
 
-// At once: a click may come before the next picture.
+// Immediately, as a click may come before the next frame is drawn.
 on("selection tool", () => { if (!handled()) layer.style.display = "none"; });
 
 function placeHandles() {
@@ -76,7 +76,7 @@ function placeNames() {
                   text: `${track.id} ${track.class}` });
   }
   if (store.names) wanted.push(...resultNames());
-  const shown = apart(wanted);
+  const shown = selectNames(wanted);
   while (names.children.length < shown.length) names.append(element("div", { class: "name" }));
   for (const [k, tag] of [...names.children].entries()) {
     const entry = shown[k];
@@ -89,8 +89,8 @@ function placeNames() {
   }
 }
 
-/** Those names that do not lie over each other: the chosen one, then errors, then the nearest. */
-function apart(wanted) {
+/** Select names that do not overlap: the selected box first, then errors, then the nearest. */
+function selectNames(wanted) {
   const rank = (entry) => (entry.chosen ? 0 : entry.loud ? 1000 : 2000) + entry.far;
   const shown = [];
   for (const entry of wanted) {
@@ -107,20 +107,20 @@ function apart(wanted) {
 }
 afterDrawing.push(placeHandles, placeNames);
 
-/** Follow the pointer from here on: move(event) for each step; commits at the end. Escape gives up,
- * as does another selection or frame. A hand that only clicked moves nothing. */
-export function follow(target, event, move) {
+/** Start a drag: call move(event) for each step and commit at the end. Escape, another selection or
+ * another frame cancels it, and a movement within CLICK_RADIUS does nothing. */
+export function startDrag(target, event, move) {
   target.setPointerCapture(event.pointerId);
   controls.enabled = false;
   const { selected, frame } = store, { clientX, clientY } = event;
-  let given = false, moved = false;
+  let cancelled = false, moved = false;
   const step = (e) => {
-    moved ||= Math.hypot(e.clientX - clientX, e.clientY - clientY) > STILL;
-    if (!given && (store.selected !== selected || store.frame !== frame)) {
-      given = true;
+    moved ||= Math.hypot(e.clientX - clientX, e.clientY - clientY) > CLICK_RADIUS;
+    if (!cancelled && (store.selected !== selected || store.frame !== frame)) {
+      cancelled = true;
       dropDraft();
     }
-    if (!given && moved) move(e);
+    if (!cancelled && moved) move(e);
   };
   const stop = (e) => {
     target.removeEventListener("pointermove", step);
@@ -128,13 +128,13 @@ export function follow(target, event, move) {
     target.removeEventListener("pointercancel", stop);
     removeEventListener("keydown", escape, true);
     controls.enabled = true;
-    if (given || e.type === "pointercancel") dropDraft();
+    if (cancelled || e.type === "pointercancel") dropDraft();
     else commit();
   };
   const escape = (e) => {
     if (e.key !== "Escape") return;
     e.stopPropagation();
-    given = true;
+    cancelled = true;
     dropDraft();
   };
   target.addEventListener("pointermove", step);
@@ -143,7 +143,7 @@ export function follow(target, event, move) {
   addEventListener("keydown", escape, true);
 }
 
-/** Drag a face along its own axis, or the ring about the box. */
+// Drag a face along its own axis, or the ring around the box.
 layer.addEventListener("pointerdown", (event) => {
   const name = event.target.dataset?.handle, start = selectedBox()?.box;
   if (!name || !start || event.button !== 0) return;
@@ -155,7 +155,7 @@ layer.addEventListener("pointerdown", (event) => {
       return at && Math.atan2(at[1] - start[1], at[0] - start[0]);
     };
     const first = angleOf(from);
-    follow(event.target, event, (e) => {
+    startDrag(event.target, event, (e) => {
       const now = angleOf(rayAt(e.clientX, e.clientY));
       if (first !== null && now !== null) setDraft(turnBy(start, now - first));
     });
@@ -167,19 +167,19 @@ layer.addEventListener("pointerdown", (event) => {
   local[axis] = sign * start[3 + axis] / 2;
   const centre = toWorld(start, ...local);
   const first = nearestOnLine(centre, along, from.origin, from.direction);
-  follow(event.target, event, (e) => {
+  startDrag(event.target, event, (e) => {
     const { origin, direction } = rayAt(e.clientX, e.clientY);
     const now = nearestOnLine(centre, along, origin, direction);
     if (first !== null && now !== null) setDraft(moveFace(start, axis, sign, now - first));
   });
 });
 
-/** Drag the body of the selected box over the level plane in which it was taken. */
+/** Drag the selected box horizontally, at the height of its centre. */
 export function dragBody(target, event) {
   const start = selectedBox()?.box, from = rayAt(event.clientX, event.clientY);
   const first = meetLevel(from.origin, from.direction, start[2]);
   if (!selectedTrack() || !first) return false;
-  follow(target, event, (e) => {
+  startDrag(target, event, (e) => {
     const { origin, direction } = rayAt(e.clientX, e.clientY);
     const now = meetLevel(origin, direction, start[2]);
     if (now) setDraft(moveBy(start, now[0] - first[0], now[1] - first[1], 0));

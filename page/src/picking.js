@@ -1,4 +1,4 @@
-// What lies under the pointer: a point of the cloud, or a box.
+// Picking: finds the point of the cloud, or the box, under the pointer.
 
 import * as THREE from "three";
 import { rayBox } from "./boxmath.js";
@@ -7,10 +7,10 @@ import { camera, renderer } from "./scene.js";
 import { resultBoxes } from "./results.js";
 import { on, store } from "./store.js";
 
-const REACH = 9; // pixels round the pointer in which a point is taken
+const REACH = 9; // pixels around the pointer
 const ahead = new THREE.Vector3(), matrix = new THREE.Matrix4();
 
-/** The ray of a place on the page: {origin, direction}. */
+/** The ray through a position on the page: {origin, direction}. */
 export function rayAt(clientX, clientY) {
   const area = renderer.domElement.getBoundingClientRect();
   ahead.set((clientX - area.left) / area.width * 2 - 1, 1 - (clientY - area.top) / area.height * 2, 0.5)
@@ -18,7 +18,7 @@ export function rayAt(clientX, clientY) {
   return { origin: camera.position.toArray(), direction: ahead.toArray() };
 }
 
-/** Where a point of the sensor's frame is in the picture, pixels; null behind the camera. */
+/** Project a point of the sensor's frame to pixels; null behind the camera. */
 export function project(x, y, z) {
   const area = renderer.domElement;
   ahead.set(x, y, z).applyMatrix4(camera.matrixWorldInverse);
@@ -27,10 +27,9 @@ export function project(x, y, z) {
   return [(ahead.x + 1) / 2 * area.clientWidth, (1 - ahead.y) / 2 * area.clientHeight];
 }
 
-/** Index of the point of the cloud that is seen under the pointer, or -1. All points are put
- * through the camera's matrix, which costs less than a tree of a cloud that is new each frame, and
- * are not divided by their depth; of those within reach the nearest to the eye wins, unless one
- * little behind is nearer to the pointer. */
+/** Index of the point under the pointer, or -1: among the points within REACH the nearest to the
+ * camera, unless one slightly behind is nearer to the pointer. Testing all points costs less than
+ * building a tree for every frame. */
 export function pointAt(clientX, clientY) {
   const { cloud } = store;
   if (!cloud) return -1;
@@ -55,27 +54,27 @@ export function pointAt(clientX, clientY) {
   return best;
 }
 
-/** Whose box the pointer meets first: the id of a track, or a label or detection that is looked at,
- * or neither. */
+/** The nearest box under the pointer: {track, found}, the id of a track, or a label or detection;
+ * null where it is not. */
 export function hitAt(clientX, clientY) {
   const { origin, direction } = rayAt(clientX, clientY), view = store.mode === "view";
   const boxes = view && !store.layers.tracks ? [] : shownBoxes();
   let best = { track: null, found: null }, least = Infinity;
-  for (const each of view ? [...boxes, ...resultBoxes()] : boxes) {
-    const along = rayBox(origin, direction, each.box);
+  for (const entry of view ? [...boxes, ...resultBoxes()] : boxes) {
+    const along = rayBox(origin, direction, entry.box);
     if (along === null || along >= least) continue;
     least = along;
-    best = each.track ? { track: each.track.id, found: null } : { track: null, found: each };
+    best = entry.track ? { track: entry.track.id, found: null } : { track: null, found: entry };
   }
   return best;
 }
 
-const WARM = 4; // so many picks at rest, and the browser has compiled the loop
+const WARM_UPS = 4; // picks until the browser has compiled the loop
 let warmed = 0;
 
-/** The first pick would take ten times as long as those after it. */
-export function warmUp() {
-  if (!store.cloud?.count || warmed >= WARM) return;
+/** Pick while idle: the first picks take ten times as long as later ones. */
+function warmUp() {
+  if (!store.cloud?.count || warmed >= WARM_UPS) return;
   const area = renderer.domElement.getBoundingClientRect();
   pointAt(area.left + area.width / 2, area.top + area.height / 2);
   warmed += 1;

@@ -1,4 +1,4 @@
-// Playing at 10 Hz, as fast as the frames come if that is slower.
+// Playback at 10 Hz, or slower if frames load slower.
 
 import { cloudOf, goTo } from "./cloud.js";
 import { pauseLive } from "./live.js";
@@ -39,7 +39,7 @@ function stop() {
   changed("playing");
 }
 
-/** Another frame, after which nothing goes on by itself. */
+/** Stop playback and go to a frame. */
 export function to(frame) {
   stop();
   return goTo(frame);

@@ -3,7 +3,7 @@
 import { rayBox } from "./boxmath.js";
 import { addAt, seedAt } from "./edits.js";
 import { say } from "./messages.js";
-import { dragBody, STILL } from "./overlay.js";
+import { CLICK_RADIUS, dragBody } from "./overlay.js";
 import { hitAt, pointAt, rayAt } from "./picking.js";
 import { controls, mark, renderer } from "./scene.js";
 import { changed, on, select, selectFound, selectedBox, store } from "./store.js";
@@ -28,7 +28,7 @@ canvas.addEventListener("pointerup", (event) => {
   if (!down || event.button !== 0) return;
   const moved = Math.hypot(event.clientX - down[0], event.clientY - down[1]);
   down = null;
-  if (moved <= STILL) click(event);
+  if (moved <= CLICK_RADIUS) click(event);
 });
 
 function click(event) {
@@ -40,7 +40,7 @@ function click(event) {
   }
   const index = pointAt(event.clientX, event.clientY);
   if (index < 0) {
-    say("There is no point here; click on one of the object's points.");
+    say("There is no point here; click one of the object's points.");
     return;
   }
   const xyz = [...store.cloud.xyz.subarray(3 * index, 3 * index + 3)];
@@ -82,7 +82,7 @@ export function setTool(tool) {
   changed("tool");
 }
 
-/** What a click would do in the middle of the view, for who works without a mouse. */
+/** Do what a click in the middle of the view would do, for use without a mouse. */
 export function useCentre() {
   const area = canvas.getBoundingClientRect();
   click({ clientX: area.left + area.width / 2, clientY: area.top + area.height / 2 });

@@ -1,11 +1,11 @@
-// The cloud in the 3D view. Without a GPU a picture of all its points takes a tenth of a second: while
-// the camera stands still it is kept, with its depth, and what else has changed is drawn over it.
+// The cloud in the 3D view. Without a GPU, drawing all points takes a tenth of a second, so while the
+// camera stands still their image and depth are cached, and everything else is drawn over it.
 
 import * as THREE from "three";
 import { SEEN, paint, rgb, theme } from "./colours.js";
 import { store } from "./store.js";
 
-const size = { value: 2 }; // pixels of a far point
+const size = { value: 2 }; // pixels of a distant point
 const vertexShader = `attribute vec4 colour; uniform float size, nearer; varying vec3 shade;
   void main() { shade = colour.rgb; gl_Position = projectionMatrix * modelViewMatrix
     * vec4(position, 1.0); gl_Position.z -= nearer * gl_Position.w;
@@ -28,7 +28,7 @@ const kept = new THREE.Mesh(new THREE.PlaneGeometry(2, 2), new THREE.ShaderMater
       gl_FragColor = texelFetch(colour, at, 0); gl_FragDepth = far; }`,
   depthFunc: THREE.AlwaysDepth,
 }));
-kept.renderOrder = -1; // the first, so that all else is before or behind it
+kept.renderOrder = -1; // first, for correct depth tests
 
 let shown = null, marked = 0, painted = 0, most = Infinity, keptAs = "";
 
@@ -39,7 +39,7 @@ export function openPoints(scene) {
   }
 }
 
-/** The cloud of the frame shown, coloured. */
+/** Show the cloud of the frame, coloured. */
 export function setPoints() {
   const { cloud } = store;
   if (cloud !== shown) {
@@ -54,7 +54,7 @@ export function setPoints() {
   painted += 1;
 }
 
-/** The points of one cluster stand out; 0 for none. Whether that is new. */
+/** Highlight the points of one cluster; 0 for none. Returns true if that is a change. */
 export function markPoints(cluster) {
   if (cluster === marked) return false;
   marked = cluster;
@@ -75,7 +75,7 @@ function setGeometry(thing, xyz, colours) {
   thing.geometry.setAttribute("colour", new THREE.BufferAttribute(colours, 4, true));
 }
 
-/** Draw the first so many of this cloud and those after it; their order is random. */
+/** Draw only the first `count` points of this and later clouds; their order is random. */
 export function thinTo(count) {
   most = count;
   points.geometry.setDrawRange(0, count);
@@ -83,8 +83,7 @@ export function thinTo(count) {
 export const pointCount = () => Math.min(points.geometry.drawRange.count, shown?.count ?? 0);
 export const setPointSize = (pixels) => { size.value = pixels; };
 
-/** A picture of the scene; keep: the camera stands still, and the points are as they were where
- * neither they nor the view have changed. */
+/** Draw the scene. keep: use the cached image of the points, updated if they or the view changed. */
 export function render(renderer, scene, camera, keep) {
   kept.visible = keep;
   points.visible = !keep;

@@ -1,33 +1,32 @@
-// In view mode: labels, what each source detected, what was missed and what is false.
+// Labels and detections of a frame, with missed and false ones.
 
 import { getJson } from "./api.js";
 import { colourOfClass } from "./colours.js";
 import { sayError } from "./messages.js";
-import { goTo } from "./cloud.js";
-import { say } from "./messages.js";
-import { changed, on, selectFound, store } from "./store.js";
+import { changed, on, store } from "./store.js";
 
 export const MISSED = "#ff4d5e", FALSE = "#ffb020";
 const SOURCES = ["#22c1a6", "#a78bfa", "#38bdf8", "#f472b6", "#a3e635", "#fb923c"];
 const LABEL = "#94a3b8";
 
-const kept = new Map(); // frame -> promise
-const KEPT = 300, NOTHING = { labels: [], detections: {}, matches: {} };
+const cache = new Map(); // frame -> promise
+const MAX_CACHED = 300, NOTHING = { labels: [], detections: {}, matches: {} };
 
-/** Boxes of the frame shown besides those of tracks: {box, colour, strong, text, chosen}, and what
- * each is of: {frame, layer, k, row, wrong}. */
+/** Boxes of labels and detections in the frame shown: {box, colour, strong, text, chosen}, and their
+ * origin: {frame, layer, k, row, wrong}. */
 export function resultBoxes() {
   return store.results.frame === store.frame ? boxesIn(store.results, store.frame) : [];
 }
 
-function boxesIn({ labels, detections, matches }, frame) {
+/** The same for given results of a frame. */
+export function boxesIn({ labels, detections, matches }, frame) {
   const found = [];
   const add = (entry, layer, k, row) => {
     const { found: it } = store;
     found.push({ ...entry, box: row.slice(0, 7), frame, layer, k, row,
       chosen: it?.frame === frame && it.layer === layer && it.k === k });
   };
-  const compared = [...store.sources].find(([, { shown }]) => shown)?.[0];
+  const compared = firstShown();
   const rowsOf = (rows) => new Set((store.layers.errors && rows) || []);
   const missed = rowsOf(matches[compared]?.missed), passed = rowsOf(matches[compared]?.ignored_labels);
   if (store.layers.labels) {
@@ -57,44 +56,14 @@ export const resultNames = () => resultBoxes().filter(({ text }) => text !== nul
   .map(({ box, colour, strong, text, chosen }) => ({ box, colour, text, chosen, loud: strong,
     state: "found" }));
 
-let search = 0;
+const firstShown = () => [...store.sources].find(([, { shown }]) => shown)?.[0];
 
-/** The next, or by -1 the last, label that was missed or detection that is false, in this frame or
- * another. */
-export async function nextWrong(by) {
-  const mine = ++search, { frames, first } = store.drive;
-  const wrongIn = (results, frame) => boxesIn(results, frame).filter(({ wrong }) => wrong);
-  let { frame } = store, wrong = wrongIn(store.results, frame);
-  let at = wrong.findIndex(({ chosen }) => chosen);
-  at = at < 0 && by < 0 ? wrong.length - 1 : at + by;
-  try {
-    while (!wrong[at]) {
-      frame += by;
-      if (frame < first || frame >= frames.length) {
-        say(`Nothing is missed or false ${by > 0 ? "after" : "before"} this.`);
-        return;
-      }
-      wrong = wrongIn(await resultsOf(frame), frame);
-      if (mine !== search) return;
-      at = by > 0 ? 0 : wrong.length - 1;
-    }
-    await goTo(frame);
-    await loadResults();
-  } catch (error) {
-    sayError(error.message);
-    return;
-  }
-  if (mine !== search || store.frame !== frame) return;
-  selectFound(wrong[at]);
-  changed("focus");
-}
-
-/** Counts of the frame shown, of the first source shown. labels = hits + missed + ignoredLabels,
- * found = hits + false + ignored; null where that is not known: without labels, of a running graph,
- * and for a new score until the server has answered. */
+/** Counts for the first shown source in the frame shown: labels = hits + missed + ignoredLabels,
+ * found = hits + false + ignored. Null if unknown: without labels, for a running graph, and for a new
+ * score until the server has answered. */
 export function resultCounts() {
   const { labels, detections, matches, score } = store.results;
-  const source = [...store.sources].find(([, { shown }]) => shown)?.[0];
+  const source = firstShown();
   const match = score === store.minScore ? matches[source] : undefined;
   const missed = match?.missed.length ?? null, ignoredLabels = match?.ignored_labels.length ?? null;
   return { source, labels: labels.length, missed, ignoredLabels,
@@ -103,24 +72,18 @@ export function resultCounts() {
            false: match?.false?.length ?? null, ignored: match?.ignored?.length ?? null };
 }
 
-/** The answer of the server for a frame, asked for once. */
+/** The results of a frame, requested from the server once. */
 export function resultsOf(frame) {
-  if (!kept.has(frame)) {
-    const asked = getJson(`/api/labels/${frame}?score=${store.minScore}`);
-    asked.catch(() => kept.delete(frame));
-    kept.set(frame, asked);
-    if (kept.size > KEPT) kept.delete(kept.keys().next().value);
+  if (!cache.has(frame)) {
+    const reply = getJson(`/api/labels/${frame}?score=${store.minScore}`);
+    reply.catch(() => cache.delete(frame));
+    cache.set(frame, reply);
+    if (cache.size > MAX_CACHED) cache.delete(cache.keys().next().value);
   }
-  return kept.get(frame);
+  return cache.get(frame);
 }
 
-/** What is known of a frame has changed. */
-export function forget(frame) {
-  kept.delete(frame);
-  if (frame === store.frame && store.cloud) loadResults();
-}
-
-/** Show those of the frame shown; boxes of another frame are never seen with it. */
+/** Load the results of the frame shown, and never show those of another one. */
 export async function loadResults() {
   const { frame, minScore: score } = store;
   let found = NOTHING;
@@ -142,8 +105,12 @@ export async function loadResults() {
 }
 
 export function reload() {
-  kept.clear();
+  cache.clear();
   loadResults();
 }
 
 on("frame", loadResults);
+on("live-frame", (frame) => { // it is new, or has late boxes
+  cache.delete(frame);
+  if (frame === store.frame && store.cloud) loadResults();
+});

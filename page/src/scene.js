@@ -1,4 +1,4 @@
-// The 3D view: one cloud, the boxes, a camera. It draws when something has changed, and only then.
+// The 3D view: one cloud, the boxes, a camera. It is drawn only after changes.
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
@@ -30,7 +30,7 @@ const rings = new THREE.LineSegments(new THREE.BufferGeometry(),
 rings.frustumCulled = false;
 scene.add(rings);
 
-/** Whether there is no GPU; smooth edges then cost two thirds of the time of a picture. */
+/** True without a GPU; antialiasing would then take two thirds of the drawing time. */
 function drawsInSoftware() {
   const gl = document.createElement("canvas").getContext("webgl2");
   const known = gl?.getExtension("WEBGL_debug_renderer_info");
@@ -39,9 +39,9 @@ function drawsInSoftware() {
   return /swiftshader|llvmpipe|software/i.test(name);
 }
 
-/** Called after each picture, for what is laid over it. */
+/** Functions that are called after each drawing, for overlays. */
 export const afterDrawing = [];
-export const drawn = { ms: 0, pictures: 0, points: 0 }; // the last picture, for measuring
+export const drawn = { ms: 0, pictures: 0, points: 0 }; // the last drawing, for measurements
 
 let asked = false, resting = 0, still = true;
 
@@ -78,7 +78,7 @@ function setCloud() {
   if (!store.cloud) return;
   setPoints();
   setRings(store.cloud.floor);
-  moving(); // a thinned picture at once, then all
+  moving(); // thinned at first, then all points
 }
 
 function repaint() {
@@ -87,7 +87,7 @@ function repaint() {
   draw();
 }
 
-/** Show one cluster of the cloud apart from the others; 0 for none. */
+/** Highlight one cluster of the cloud; 0 for none. */
 export function mark(cluster) {
   if (store.cloud && markPoints(cluster)) draw();
 }
@@ -103,7 +103,7 @@ function setRings(floor) {
       }
     }
   }
-  at.push(0, 0, floor, 3, 0, floor); // the way ahead
+  at.push(0, 0, floor, 3, 0, floor); // the forward direction
   rings.geometry.setAttribute("position", new THREE.Float32BufferAttribute(at, 3));
 }
 
@@ -127,7 +127,7 @@ function resize() {
   draw();
 }
 
-/** The view one begins with: from behind the sensor, ahead. */
+/** The initial view: from behind the sensor, forward. */
 export function resetView() {
   camera.position.set(-16, 0, 12);
   controls.target.set(8, 0, -1);
@@ -135,7 +135,7 @@ export function resetView() {
   draw();
 }
 
-/** Look at a place from another, both in the sensor's frame. */
+/** Look at a position from another, both in the sensor's frame. */
 export function lookAt(place, from) {
   controls.target.fromArray(place);
   camera.position.fromArray(from);
@@ -150,7 +150,7 @@ export function topView() {
   controls.update();
 }
 
-/** Look at the selected box from where one is, near enough to work on it. */
+/** Zoom in on the selected box, keeping the direction of view. */
 export function focus() {
   const box = selectedBox()?.box;
   if (!box) return;
@@ -165,7 +165,7 @@ export function focus() {
 
 const distance = () => camera.position.distanceTo(controls.target);
 
-/** Move the camera along the ground by shares of its distance, turn it, or go nearer. */
+/** Move the camera along the ground by shares of its distance, turn it, or scale its distance. */
 export function fly(right, ahead, turn = 0, nearer = 1) {
   const away = camera.position.clone().sub(controls.target);
   const level = new THREE.Vector3(-away.x, -away.y, 0).normalize();

@@ -1,22 +1,22 @@
-// Top, side and front of the selected box, level and along its own axes: the points near it, its
-// faces to drag, its body to move, a ring to turn. Each view keeps still while something is dragged.
+// Top, side and front view of the selected box, along its own axes, with handles for its faces, its
+// body and its heading. The views do not move during a drag.
 
 import { moveFace, moveAlong, toLocal, turnBy } from "./boxmath.js";
 import { theme } from "./colours.js";
 import { element, svg } from "./dom.js";
 import { setDraft } from "./edits.js";
-import { follow } from "./overlay.js";
+import { startDrag } from "./overlay.js";
 import { on, selectedBox, store } from "./store.js";
 
-// Which local axis goes right and which up, with its sign: 0 length, 1 width, 2 height.
+// The local axes that point right and up, and the sign of the first: 0 length, 1 width, 2 height.
 const VIEWS = [
   { name: "top", title: "Top", right: 0, up: 1, flip: 1, turns: true },
   { name: "side", title: "Side", right: 0, up: 2, flip: 1 },
-  { name: "front", title: "Front", right: 1, up: 2, flip: -1 }, // seen from ahead
+  { name: "front", title: "Front", right: 1, up: 2, flip: -1 }, // seen from the front
 ];
 const NAMES = "xyz";
 const POINTS = { dark: ["#7f8ea8", "#ffffff", "#3b4558"], light: ["#8794a8", "#0b1220", "#c3ccd8"] };
-const MARGIN = 0.6, KNOB = 20; // metres round the box; pixels from the front to the knob
+const MARGIN = 0.6, KNOB = 20; // metres around the box; pixels from the front to the knob
 
 let anchor = null, near = [], zoom = 1;
 
@@ -53,13 +53,13 @@ function build(view) {
   return view.panel;
 }
 
-/** Metres to pixels: the box with a margin fills the view. */
+/** Pixels per metre, so that the box with a margin fills the view. */
 function scaleOf(view, width, height) {
   const along = anchor[3 + view.right] + 2 * MARGIN, across = anchor[3 + view.up] + 2 * MARGIN;
   return zoom * Math.min(width / along, height / across);
 }
 
-/** Points in a block round the anchor, in its axes: [u, v, w, ground] a point. */
+/** Collect the points around the anchor, in its axes: [u, v, w, ground] each. */
 function gather() {
   near = [];
   const { cloud } = store;
@@ -80,7 +80,7 @@ function grab(view, event) {
   const area = view.layer.getBoundingClientRect(), scale = scaleOf(view, area.width, area.height);
   const held = anchor.slice(), first = [event.clientX, event.clientY];
   const turned = start[6] - held[6];
-  follow(event.target, event, (e) => {
+  startDrag(event.target, event, (e) => {
     let across = (e.clientX - first[0]) / scale * view.flip, up = -(e.clientY - first[1]) / scale;
     if (name === "yaw") {
       const u = (e.clientX - area.left - area.width / 2) / scale;
@@ -89,7 +89,7 @@ function grab(view, event) {
       setDraft(turnBy(start, Math.atan2(v - centre[1], u - centre[0]) - turned));
       return;
     }
-    if (view.turns) { // into the axes of the box, which may be turned in this view
+    if (view.turns) { // to the axes of the box, which may be turned in this view
       const c = Math.cos(turned), s = Math.sin(turned);
       [across, up] = [c * across + s * up, -s * across + c * up];
     }
@@ -105,7 +105,7 @@ function grab(view, event) {
   });
 }
 
-/** Whether each of the points near is in a box. */
+/** For each collected point, whether it is in a box. */
 function within(box) {
   const c = Math.cos(box[6] - anchor[6]), s = Math.sin(box[6] - anchor[6]);
   const centre = toLocal(anchor, box[0], box[1], box[2]), [l, w, h] = box.slice(3, 6).map((v) => v / 2);
@@ -130,7 +130,7 @@ function drawView(view, box, isIn) {
   if (!box) return;
   const scale = scaleOf(view, width, height), depth = 3 - view.right - view.up;
   const colours = POINTS[theme()], dot = (near.length > 3000 ? 1.2 : 1.8) * ratio;
-  const places = [[], [], []]; // of points outside, inside, on the ground: x, y in turn
+  const places = [[], [], []]; // x, y, x, y, … of points outside, inside, and on the ground
   for (const [k, point] of near.entries()) {
     const x = (width / 2 + point[view.right] * scale * view.flip) * ratio - dot / 2;
     const y = (height / 2 - point[view.up] * scale) * ratio - dot / 2;

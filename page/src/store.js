@@ -1,4 +1,4 @@
-// What the page knows, in one place. Parts subscribe to the names of what changed; nobody else
+// The state of the page, and its events. Modules subscribe to the names of changes; no other module
 // holds a copy of a track.
 
 const listeners = new Map();
@@ -8,20 +8,21 @@ export const store = {
   drive: null, mode: "label",
   seq: 0, tracks: new Map(), checked: new Set(), seeds: [], canUndo: false, canRedo: false,
   progress: null,
-  wanted: 0, // the frame that was asked for
-  frame: 0, // the frame that is shown; every edit is of this one
-  cloud: null, // of the frame that is shown
+  wanted: 0, // the requested frame
+  frame: 0, // the frame shown; every edit is in this one
+  cloud: null, // of the frame shown
   selected: null, also: new Set(), hover: null, // of tracks, by id
-  found: null, // the label or detection that is selected: {frame, layer, k, row, wrong}
+  found: null, // the selected label or detection: {frame, layer, k, row, wrong}
   status: null, // of a running graph
   tool: "select", // "select", "seed", "add"
-  draft: null, // {track, frame, box}: only while something is dragged, or a key held
+  draft: null, // {track, frame, box}, only during a drag or while a key is held
   colour: "height", names: true, online: true, playing: false, advance: true,
   filter: "left", only: null, shownTracks: [],
   results: { labels: [], detections: {}, matches: {} }, sources: new Map(), minScore: 0,
   layers: { labels: true, errors: true, tracks: true, trails: true },
 };
 
+/** Call a listener for changes and events of these names, separated by spaces. */
 export function on(names, listener) {
   for (const name of names.split(" ")) {
     if (!listeners.has(name)) listeners.set(name, []);
@@ -29,7 +30,12 @@ export function on(names, listener) {
   }
 }
 
-/** Tell who subscribed, once per turn of the event loop however often it is called. */
+/** Call the listeners of an event at once. */
+export function emit(name, value) {
+  for (const listener of listeners.get(name) ?? []) listener(value);
+}
+
+/** Report changes; each listener is called once per turn of the event loop, without arguments. */
 export function changed(...names) {
   if (pending.size === 0) queueMicrotask(flush);
   for (const name of names) pending.add(name);
@@ -57,18 +63,40 @@ function toTrack(sent) {
 }
 
 export function setState(state) {
-  if (state.seq < store.seq) return; // on its way it was overtaken by an event
+  if (state.seq < store.seq) return; // an event has overtaken it
   store.tracks = new Map(state.tracks.map((track) => [track.id, toTrack(track)]));
   store.seeds = state.seeds ?? [];
-  takeCounts(state);
+  setCounts(state);
   forgetMissing();
   store.draft = null;
   changed("tracks", "progress", "selection", "draft");
 }
 
-/** Tracks of one frame of a running graph, added to what is known; boxes before `first` are kept no
- * more. */
-export function takeTracks(tracks, first) {
+/** Set the drive or graph; frames of a graph are stored by their numbers. */
+export function setDrive(drive) {
+  if (drive.live) {
+    const frames = [];
+    for (const frame of drive.frames) frames[frame.frame] = { ...frame, pose: null };
+    drive.frames = frames;
+    store.status = drive.status;
+  }
+  drive.first ??= 0;
+  store.drive = drive;
+}
+
+/** Take a new frame of a running graph, or an old one with late boxes; then emit "live-frame". */
+export function addLiveFrame({ first, frame, tracks, ...rest }) {
+  const { drive } = store;
+  drive.frames[frame] = { ...rest, pose: null };
+  for (let k = drive.first; k < first; k++) delete drive.frames[k];
+  drive.first = first;
+  addTracks(tracks, first);
+  emit("live-frame", frame);
+  changed("tracks", "wanted");
+}
+
+/** Add the tracks of one frame of a running graph, and drop boxes before `first`. */
+function addTracks(tracks, first) {
   for (const sent of tracks) {
     const track = store.tracks.get(sent.id);
     if (!track) {
@@ -91,17 +119,17 @@ export function takeTracks(tracks, first) {
   forgetMissing();
 }
 
-/** One action of any page. */
+/** Apply the event of an action of any page. */
 export function applyEvent(event) {
   for (const track of event.tracks ?? []) store.tracks.set(track.id, toTrack(track));
   for (const id of event.removed ?? []) store.tracks.delete(id);
   if (event.seeds) store.seeds = event.seeds;
-  takeCounts(event);
+  setCounts(event);
   forgetMissing();
   changed("tracks", "progress", "selection");
 }
 
-function takeCounts(from) {
+function setCounts(from) {
   store.seq = from.seq ?? store.seq;
   store.checked = from.checked ? new Set(from.checked) : store.checked;
   store.canUndo = from.can_undo ?? store.canUndo;
@@ -135,7 +163,7 @@ export function selectedTrack() {
   return store.selected === null ? null : store.tracks.get(store.selected) ?? null;
 }
 
-/** The box of a track in the frame shown, as it is dragged just now: {box, kind} or null. */
+/** The box of a track in the frame shown, or its draft: {box, kind} or null. */
 export function boxOf(track, frame = store.frame) {
   const { draft } = store;
   if (draft && track && draft.track === track.id && draft.frame === frame) {

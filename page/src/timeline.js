@@ -1,4 +1,4 @@
-// Tracks over frames: what was set by hand, proposed, interpolated; where one is; what is checked.
+// The timeline: boxes of each track by kind, the current frame, checked frames.
 
 import { colourOfClass, theme } from "./colours.js";
 import { goTo } from "./cloud.js";
@@ -33,7 +33,7 @@ function paint() {
   canvas.height = height * ratio;
   canvas.style.height = `${height}px`;
   document.getElementById("timeline-length").style.height =
-    `${Math.max(0, HEAD + rows().length * ROW - height)}px`; // beyond the canvas, which stays
+    `${Math.max(0, HEAD + rows().length * ROW - height)}px`; // below the canvas, which is sticky
   const pen = canvas.getContext("2d"), ink = INK[theme()], wide = cell();
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.clearRect(0, 0, width, height);
@@ -142,7 +142,7 @@ export function openTimeline() {
     name.textContent = frame.name.length < 20 ? frame.name : `${seconds.toFixed(2)} s`;
     name.title = frame.name;
   });
-  on("selection", () => { // keep the row of the selected track in sight
+  on("selection", () => { // scroll to the row of the selected track
     const row = rows().findIndex((track) => track.id === store.selected);
     const top = row * ROW, seen = box.clientHeight - HEAD - ROW;
     if (row < 0) return;

@@ -1,4 +1,4 @@
-// The bar above: the drive, how far one is, undo, tools, theme, help; dialogs that belong to it.
+// The top bar: drive, progress, undo, tools, theme, help; and the dialogs for import and export.
 
 import { act, exportLabels } from "./api.js";
 import { element, icon } from "./dom.js";
@@ -30,7 +30,7 @@ function nextTheme() {
 export function setTheme(name) {
   document.documentElement.dataset.theme = name;
   by("theme").title = `Theme: ${name === "auto" ? "as the system" : name}`;
-  try { localStorage.setItem("theme", name); } catch { /* then it holds for this page */ }
+  try { localStorage.setItem("theme", name); } catch { /* not stored, so it only applies to this page */ }
   changed("theme");
 }
 
@@ -41,7 +41,7 @@ export function openTopbar() {
     if (button) button.onclick = run;
   }
   let kept = new URLSearchParams(location.search).get("theme");
-  try { kept ??= localStorage.getItem("theme") ?? "auto"; } catch { /* not allowed to keep anything */ }
+  try { kept ??= localStorage.getItem("theme") ?? "auto"; } catch { /* storage is not allowed */ }
   setTheme(THEMES.includes(kept) ? kept : "auto");
   for (const how of COLOURS) by("colour").append(element("option", { value: how }, how));
   by("colour").onchange = () => setColour(by("colour").value);
@@ -54,7 +54,7 @@ export function openTopbar() {
   by("import-form").onsubmit = sendImport;
   on("drive", showDrive);
   on("progress drive", showProgress);
-  on("tracks drive", () => { // where none can come, there is nothing to be seen over time
+  on("tracks drive", () => { // hide the timeline if there can be no tracks
     document.documentElement.dataset.tracks = store.drive && store.mode === "view"
       && !store.drive.live && store.tracks.size === 0 ? "none" : "some";
   });
@@ -64,14 +64,14 @@ export function openTopbar() {
   on("connection", () => {
     by("lost").hidden = store.online;
     by("lost").textContent = store.refused
-      ? "The server was started again. Open the address that it printed: its token is a new one."
-      : "Connection lost. What was saved is safe; trying again…";
+      ? "The server was restarted. Open the address that it printed, which has a new token."
+      : "Connection lost. Saved labels are safe; reconnecting…";
   });
   on("colour", () => { by("colour").value = store.colour; });
   on("tool drive", showTool);
   on("playing", () => {
     by("play").replaceChildren(icon(store.playing ? "pause" : "play"));
-    const live = store.drive?.live, what = live ? ["Follow what comes", "Pause"] : ["Play", "Stop"];
+    const live = store.drive?.live, what = live ? ["Show the newest frames", "Pause"] : ["Play", "Stop"];
     by("play").setAttribute("aria-label", what[Number(store.playing)]);
     by("play").title = `${what[Number(store.playing)]} (Space)`;
   });
@@ -87,7 +87,7 @@ function showDrive() {
   const choices = () => (formats ?? []).map((format) =>
     element("option", { value: format }, format.replaceAll("_", " ")));
   by("export-format").replaceChildren(...choices());
-  by("import-format").replaceChildren(element("option", { value: "" }, "as it is recognised"),
+  by("import-format").replaceChildren(element("option", { value: "" }, "detect automatically"),
                                       ...choices());
 }
 
@@ -118,8 +118,8 @@ function showTool() {
   by("tool-hint").hidden = store.tool === "select" || !store.drive;
   if (by("tool-hint").hidden) return;
   by("tool-hint").firstElementChild.textContent = store.tool === "add"
-    ? "Click where the new box stands. Esc ends."
-    : "Click one of its points: similar ones are looked for in the whole drive. Esc ends.";
+    ? "Click where to place the new box. Esc ends."
+    : "Click a point of an object: similar objects are proposed in the whole drive. Esc ends.";
   by("tool-classes").replaceChildren(...store.drive.classes.slice(0, 9).map(({ name }, k) =>
     element("button", { class: "chip", "aria-pressed": String(name === classToAdd()),
       onclick: () => setClass(name) },
@@ -147,7 +147,7 @@ async function sendExport(event) {
 
 async function sendImport(event) {
   event.preventDefault();
-  const line = by("import-error"); // a message would be behind the dialog
+  const line = by("import-error"); // the dialog would hide a message
   line.textContent = "";
   if (await act({ do: "import", path: by("import-path").value, format: by("import-format").value },
     (text) => { line.textContent = text; })) by("import-dialog").close();

@@ -1,4 +1,4 @@
-// The list of tracks: what is left, accepted, rejected; the most uncertain first.
+// The list of tracks: undecided, accepted and rejected ones, the most uncertain first.
 
 import { colourOfClass, theme } from "./colours.js";
 import { goTo } from "./cloud.js";
@@ -89,7 +89,7 @@ function rebuild() {
   list.setAttribute("aria-activedescendant", at < 0 ? "" : `track-${store.selected}`);
 }
 
-/** One button a class that there are tracks of, where there are several: only these, or all again. */
+/** Show a button for each class of tracks, if there are several, that limits the list to it. */
 function showClasses() {
   const names = [...new Set([...store.tracks.values()].map((track) => track.class))].sort();
   if (store.only && !names.includes(store.only)) store.only = null;
@@ -98,12 +98,12 @@ function showClasses() {
   if (classes.hidden || classes.dataset.key === key) return;
   classes.dataset.key = key;
   classes.replaceChildren(...names.map((name) => element("button", {
-    class: "chip", "aria-pressed": String(name === store.only), title: `Only ${name}, or all again`,
+    class: "chip", "aria-pressed": String(name === store.only), title: `Only ${name}, or all`,
     onclick: () => { store.only = store.only === name ? null : name; rebuild(); },
   }, element("i", { class: "dot", style: `background:${colourOfClass(name)}` }), name)));
 }
 
-/** Only the rows in sight are made; none while one is pressed, or the click would meet another. */
+/** Make only the visible rows; none while a row is pressed, so that the click hits the same row. */
 function place() {
   if (pressed) { late = true; return; }
   const tracks = store.shownTracks, first = Math.max(0, Math.floor(list.scrollTop / ROW) - 2);
@@ -117,14 +117,14 @@ function place() {
 function emptyHint() {
   if (store.mode === "view") return "No tracks in this recording.";
   if (store.tracks.size === 0 && store.progress?.busy) {
-    return "Detectors look through the whole drive; proposals appear here when they are done. "
-      + "Meanwhile S and a click on an object, or B and a click, begin a track by hand.";
+    return "The detectors are searching the whole drive; proposals appear here when they are done. "
+      + "Meanwhile, press S and click an object, or B and click, to start a track by hand.";
   }
   if (store.tracks.size === 0) {
-    return "No tracks yet. Press P to let the detectors propose some, S and click an object, or B "
-      + "and click to add a box.";
+    return "No tracks yet. Press P to propose tracks with the detectors, S and click an object, or "
+      + "B and click to add a box.";
   }
-  return store.filter === "left" ? "Nothing is left to decide." : `None ${store.filter}.`;
+  return store.filter === "left" ? "All tracks are decided." : `No ${store.filter} tracks.`;
 }
 
 function scrollToChosen() {
@@ -158,7 +158,7 @@ export function openTrackList() {
       if (late) { late = false; place(); }
     }));
   }
-  list.addEventListener("mousedown", (event) => { // arrow keys then move the box that was chosen
+  list.addEventListener("mousedown", (event) => { // keep focus, so that arrow keys move the box
     if (event.target !== list) event.preventDefault();
   });
   list.addEventListener("keydown", (event) => {
