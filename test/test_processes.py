@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import multiprocessing
 import os
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
+from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.runs import processes
 
 SEMAPHORES = []
@@ -55,6 +57,14 @@ def test_processes_that_share_cores_use_one_thread_each():
               "      *run_in_order(count_threads, [0], 1, 1, 'worked'),\n"
               "      *run_in_processes(count_threads, [0], 1, 'worked', apart=True))\n")
     assert run_script(script, OPENBLAS_NUM_THREADS="2").stdout.split() == ["1", "1", "1", "2"]
+
+
+@pytest.mark.parametrize("work", [DetectorChoice("pointnet"), DetectorChoice("pointnet").open,
+                                  functools.partial(map, DetectorChoice("pointnet").open)])
+def test_processes_share_the_imports_of_a_detector(work):
+    """Opening a detector imports torch, which takes longer than detecting for some clouds."""
+    assert "lidar_perception.detectors.pointnet.detector" in processes._find_modules(work)
+    assert "torch" not in str(processes._find_modules(DetectorChoice("tests:Own").open))
 
 
 def test_ended_processes_release_system_resources():

@@ -136,8 +136,11 @@ def _loader(kind: str) -> Callable[..., ConfigurableDetector]:
 
 def _attribute(path: str) -> Any:
     """Return the attribute `module.name` of a module in this folder."""
-    module, _, name = path.rpartition(".")
-    return getattr(importlib.import_module(f"lidar_perception.detectors.{module}"), name)
+    return getattr(importlib.import_module(_module_name(path)), path.rpartition(".")[2])
+
+
+def _module_name(path: str) -> str:
+    return f"lidar_perception.detectors.{path.rpartition('.')[0]}"
 
 
 def _as_trained(params: Any, path: Path | None) -> Any:
@@ -209,6 +212,13 @@ class DetectorChoice:
     range: str = "auto"
     device: str = "auto"
     settings: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def later_imports(self) -> tuple[str, ...]:
+        """Modules that open() imports: importing torch takes longer than detecting for 10 clouds,
+        so processes that share the work import it once."""
+        loader = LOAD.get(resolve_weights(self.weights)[0])
+        return () if loader is None else (_module_name(loader),)
 
     def open(self, *, sensor_height: float | None = None,
              min_score: float | None = None) -> ConfigurableDetector:

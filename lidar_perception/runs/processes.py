@@ -132,11 +132,15 @@ def _end_processes(running: dict[Connection, ForkServerProcess]) -> None:
 
 
 def _find_modules(work: Any) -> set[str]:
-    """Return the modules of the functions and objects that a process is given."""
+    """Return the modules of the functions and objects that a process is given.
+
+    An object may name in `later_imports` the modules that its methods will import.
+    """
     if isinstance(work, partial):
         return set[str]().union(*map(_find_modules,
                                      (work.func, *work.args, *work.keywords.values())))
-    return {getattr(work, "__module__", "builtins")}
+    later = getattr(getattr(work, "__self__", work), "later_imports", ())
+    return {getattr(work, "__module__", "builtins"), *later}
 
 
 def _receive_result(receiver: Connection, running: dict[Connection, ForkServerProcess],
