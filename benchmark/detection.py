@@ -20,7 +20,7 @@ from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import FUSED, DetectionResult
 from lidar_perception.detectors.devices import CPU, find_device
 from lidar_perception.detectors.open import POINTPILLARS, open_detector
-from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS, network_config
+from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS, make_config
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
 from lidar_perception.detectors.pointpillars.network import make_network
 from lidar_perception.detectors.pointpillars.params import STEPS
@@ -96,7 +96,7 @@ class Heard:
 def _random_detector(version: str, size: str, device: str,
                      scan: PointCloud) -> PointPillarsDetector:
     """Warmed up, with thresholds that CANDIDATES anchors pass in this scan."""
-    config = network_config(version, size)
+    config = make_config(version, size)
     torch.manual_seed(0)
     heard = Heard(TorchNetwork(make_network(config).eval(), device))
     detector = PointPillarsDetector(PointPillarsProposer(heard, Header(config), device))

@@ -14,10 +14,10 @@ from benchmark.timing import Calls, interleaved
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
-from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of, network_input
-from lidar_perception.detectors.pointnet.config import pointnet_config
+from lidar_perception.detectors.pointnet.clusters import Clusters, make_clusters, make_network_input
+from lidar_perception.detectors.pointnet.config import make_pointnet_config
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
-from lidar_perception.detectors.pointnet.network import fused, make_pointnet
+from lidar_perception.detectors.pointnet.network import fuse_norms, make_pointnet
 from lidar_perception.detectors.pointnet.params import STEPS
 from lidar_perception.detectors.pointnet.predict import predict
 from lidar_perception.detectors.pointnet.torch_network import TorchPointNet
@@ -34,17 +34,18 @@ def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
     """Medians over whole scans. The networks have random weights, of which time does not depend,
     and read COUNT clusters of a scan, or as many as it has."""
     torch.manual_seed(0)
-    config = pointnet_config()
-    networks = {name: TorchPointNet(fused(make_pointnet(pointnet_config(name))))
+    config = make_pointnet_config()
+    networks = {name: TorchPointNet(fuse_norms(make_pointnet(make_pointnet_config(name))))
                 for name in ("improved", "pointnet2", "pointnet")}
     plain = PlainPointNet2(config).eval()
     detector = PointNetDetector(PointNetClassifier(
-        TorchPointNet(fused(make_pointnet(config)), "auto"), Header(config)))
+        TorchPointNet(fuse_norms(make_pointnet(config)), "auto"), Header(config)))
     detector.warm_up()
     rows, steps, counts = [], [], []
     for scan in scans:
         ground = segment_ground(scan, config.ground)
-        every = clusters_of(scan, cluster_obstacles(scan.xyz, ground, config.clustering), 5, ground)
+        cluster_ids = cluster_obstacles(scan.xyz, ground, config.clustering)
+        every = make_clusters(scan, cluster_ids, 5, ground)
         some = every.take(np.arange(min(COUNT, len(every))))
         calls: Calls = {name: partial(predict, network, some) for name, network in networks.items()}
         calls["plain PointNet++ (SSG)"] = partial(_plain, plain, some, config.points)
@@ -63,7 +64,7 @@ def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
 
 @torch.inference_mode()
 def _plain(network: PlainPointNet2, clusters: Clusters, count: int) -> torch.Tensor:
-    return network(torch.from_numpy(network_input(clusters, count).points))
+    return network(torch.from_numpy(make_network_input(clusters, count).points))
 
 
 def print_pointnet(content: dict) -> None:

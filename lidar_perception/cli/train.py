@@ -118,10 +118,10 @@ def pointpillars(request: TrainingRequest, params: PointPillarsTraining) -> None
       torchrun --nproc-per-node 4 -m lidar_perception.cli.main train pointpillars sim \\
           --size full --budget 12 --out v4
     """
-    from lidar_perception.detectors.pointpillars.config import RANGES, network_config
+    from lidar_perception.detectors.pointpillars.config import RANGES, make_config
     from lidar_perception.training.pointpillars.trainer import PointPillarsTrainer
     seen: dict[str, Any] = {**RANGES["around"]} if params.range == "around" else {}
-    config = network_config(params.version, params.size, **seen)  # a size by itself sees ahead
+    config = make_config(params.version, params.size, **seen)  # a size by itself sees ahead
     run(PointPillarsTrainer(config), request, params)
 
 
@@ -143,10 +143,10 @@ def pointnet(request: TrainingRequest, params: PointNetTraining) -> None:
       lidar-perception train pointnet /data/kitti/object --split train.txt \\
           --val-split val.txt --epochs 20 --out pointnet --resume
     """
-    from lidar_perception.detectors.pointnet.config import pointnet_config
+    from lidar_perception.detectors.pointnet.config import make_pointnet_config
     from lidar_perception.training.pointnet.trainer import PointNetTrainer, find_proposer
     find_proposer(params)  # raises InputError before anything is made
-    run(PointNetTrainer(pointnet_config(params.network)), request, params)
+    run(PointNetTrainer(make_pointnet_config(params.network)), request, params)
 
 
 @train.command()

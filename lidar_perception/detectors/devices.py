@@ -1,6 +1,6 @@
-"""Where a network runs, the CPU or CUDA, and in which number format.
+"""Device and number format of a network.
 
-A device is its name, such as cpu or cuda:1. torch is loaded only where a GPU may be in use.
+A device is given by its name, such as cpu or cuda:1. torch is imported only if a GPU may be used.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ CPU = "cpu"
 
 
 def find_device(name: str = "auto") -> str:
-    """Return the device of 'auto', 'cpu', 'cuda' or 'cuda:N'.
+    """Return the device for 'auto', 'cpu', 'cuda' or 'cuda:N'.
 
     Raises:
-        InputError: there is no such device.
+        InputError: the name is unknown, or the machine has no such device.
     """
     if name == CPU or (name == "auto" and not _has_gpu_driver()):
         return CPU
     match = re.fullmatch(r"auto|cuda(?::(\d+))?", name)
     if not match:
         raise InputError(f"there is no device {name!r}; choose auto, cpu, cuda or cuda:N")
-    import torch  # takes seconds
+    import torch  # slow to import
     available = torch.cuda.is_available()
     if name == "auto":
         return "cuda" if available else CPU
@@ -43,7 +43,7 @@ def find_device(name: str = "auto") -> str:
 
 
 def _has_gpu_driver() -> bool:
-    """Return True if this machine has a driver that torch could use, of NVIDIA or AMD."""
+    """Return True if this machine has a GPU driver of NVIDIA or AMD, or torch is imported."""
     if "torch" in sys.modules or Path("/dev/kfd").exists():
         return True
     try:
@@ -54,7 +54,7 @@ def _has_gpu_driver() -> bool:
 
 
 def uses_16_bits(amp: str) -> bool:
-    """Return True if the layers of a network on the CPU work in bf16; see params.layers_format."""
+    """Return True if the layers of a network use bf16 on the CPU; see params.make_amp_param."""
     return amp == "bf16" or (amp == "auto" and has_bf16())
 
 
@@ -75,6 +75,6 @@ def choose_dtype(amp: str, device: str | torch.device) -> torch.dtype | None:
 
 
 def is_out_of_memory(error: RuntimeError) -> bool:
-    """Return True for the error that torch raises when a GPU is out of memory."""
+    """Return True if torch raised this error because a GPU is out of memory."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(error, torch.cuda.OutOfMemoryError)

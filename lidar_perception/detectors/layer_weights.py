@@ -1,4 +1,4 @@
-"""Weights of layers from the tensors of a checkpoint, with batch norms folded into the layers."""
+"""Layer weights from the tensors of a checkpoint, with batch norms folded in."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ import numpy as np
 
 
 class Misfit(ValueError):
-    """The tensors are not those of the network. checkpoint.load(), which needs torch, names the
-    first one that differs."""
+    """The tensors do not belong to the network. checkpoint.load_checkpoint(), which needs torch,
+    names the first one that differs."""
 
 
 class Weights(NamedTuple):
-    """A convolution (O, I, kh, kw) or linear layer (O, I) with its bias (O,) or None, float32."""
+    """Weight (O, I, kh, kw) of a convolution or (O, I) of a linear layer, and bias (O,) or None,
+    float32."""
 
     weight: np.ndarray
     bias: np.ndarray | None
 
 
 class LayerWeights:
-    """The layers of a network by name; each is taken once.
+    """The layers of a network by name. Each layer can be taken once.
 
     Args:
         tensors: name -> array, the state_dict of a network in torch.
@@ -36,11 +37,11 @@ class LayerWeights:
 
         Args:
             shape: of its weight.
-            norm: name of the batch norm behind a layer without bias. Where the norm is folded
-                already, the layer has a bias and there is no norm.
+            norm: name of the batch norm after a layer without bias. If the norm is already folded
+                in, the layer has a bias and the norm does not exist.
 
         Raises:
-            Misfit: it is not there, or has another shape.
+            Misfit: the layer is missing or has another shape.
         """
         weight = self.array(f"{name}.weight", shape)
         if norm is None or f"{norm}.weight" not in self.tensors:
@@ -66,6 +67,6 @@ class LayerWeights:
             raise Misfit(name)
 
 
-def arrays_of(network: Any) -> dict[str, np.ndarray]:
-    """Return the state_dict of a network of torch as arrays."""
+def to_arrays(network: Any) -> dict[str, np.ndarray]:
+    """Return the state_dict of a torch network as arrays."""
     return {name: value.detach().cpu().numpy() for name, value in network.state_dict().items()}

@@ -130,10 +130,12 @@ def _emit_tile(context: Any, builder: ir.IRBuilder, signature: Any, args: Sequen
 
 @njit(cache=True, nogil=True)
 def multiply(rows, weights, bias, floor):
-    """Return (R, C) float32: rows (R, B) times weights, plus bias (C,), and not below floor.
+    """Return rows (R, B) times weights plus bias, (R, C) float32, limited below by `floor`.
 
-    weights: as packed() returns them, (blocks, 1, channels, BLOCK); B is at least `channels`, and C
-    is blocks x BLOCK.
+    Args:
+        weights: (blocks, 1, channels, BLOCK) float32 from pack_weights. B is at least `channels`,
+            and C is blocks x BLOCK.
+        bias: (C,) float32.
     """
     blocks, _, channels, _ = weights.shape
     sums = np.empty((len(rows), blocks * BLOCK), np.float32)
@@ -152,23 +154,23 @@ def multiply(rows, weights, bias, floor):
     return sums
 
 
-def packed(weights: np.ndarray) -> np.ndarray:
-    """Return weights (O, I, taps) in the memory order of tiles, padded with zeros:
+def pack_weights(weights: np.ndarray) -> np.ndarray:
+    """Return weights (O, I, taps) in the memory order of tiles, pad_channels with zeros:
     (blocks, taps, channels, BLOCK) float32."""
     out, channels, taps = weights.shape
     blocks = -(-out // BLOCK)
-    filled = np.zeros((blocks * BLOCK, padded(channels), taps), np.float32)
+    filled = np.zeros((blocks * BLOCK, pad_channels(channels), taps), np.float32)
     filled[:out, :channels] = weights
     return np.ascontiguousarray(filled.reshape(blocks, BLOCK, -1, taps).transpose(0, 3, 2, 1))
 
 
-def padded(channels: int) -> int:
+def pad_channels(channels: int) -> int:
     """Return `channels` rounded up to a multiple of UNROLL."""
     return -(-channels // UNROLL) * UNROLL
 
 
-def padded_bias(bias: np.ndarray | None, width: int) -> np.ndarray:
-    """Return a bias (O,) or None as (width,) float32, padded with zeros."""
+def pad_bias(bias: np.ndarray | None, width: int) -> np.ndarray:
+    """Return a bias (O,) or None as (width,) float32, pad_channels with zeros."""
     filled = np.zeros(width, np.float32)
     if bias is not None:
         filled[:len(bias)] = bias

@@ -14,7 +14,7 @@ import numpy as np
 
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import find_extents
-from lidar_perception.detectors.pointnet.clusters import ground_under
+from lidar_perception.detectors.pointnet.clusters import find_ground_heights
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.params import SensorPoseParams
@@ -125,7 +125,7 @@ def find_things(scene: TrainingScene, min_points: int,
     boxes = np.zeros((len(sizes), 7))
     boxes[:, :2] = (low[:, :2] + high[:, :2]) / 2
     boxes[:, 3:5] = high[:, :2] - low[:, :2]
-    floor = ground_under(xyz[ground], boxes[:, :2])
+    floor = find_ground_heights(xyz[ground], boxes[:, :2])
     boxes[:, 5] = high[:, 2] - floor
     boxes[:, 2] = floor + boxes[:, 5] / 2
     kept = ((sizes >= min_points) & (boxes[:, 3:5].max(axis=1, initial=0) <= MAX_WIDTH_M)

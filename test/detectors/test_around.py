@@ -104,9 +104,9 @@ def test_what_cannot_see_that_says_so():
     assert pointnet.with_range("around") is pointnet
     with pytest.raises(InputError, match="pointnet always covers all directions"):
         pointnet.with_range("ahead")
-    with pytest.raises(InputError, match="cannot see around: a grid of"):
+    with pytest.raises(InputError, match="does not support the range around: a grid of"):
         random_detector(low=(0.0, -3.52, -3.0), high=(7.04, 3.52, 1.0),
                         cell=0.22).with_range("around")
     exported = make_detector(SimpleNamespace(has_fixed_range=True), Header(tiny()))
-    with pytest.raises(InputError, match="use the checkpoint to see around"):
+    with pytest.raises(InputError, match="use the checkpoint for the range around"):
         exported.with_range("around")

@@ -92,5 +92,5 @@ def test_another_calibration_leaves_the_weights_as_they_are_stored(tmp_path, hal
     script = runpy.run_path(str(Path(__file__).parents[2] / "scripts/calibrate_weights.py"))
     result = CliRunner().invoke(script["main"], [str(object_folder(tmp_path / "scans", count=1)),
                                                  str(path)])
-    assert result.exit_code == 1 and "too few Car" in result.output
+    assert result.exit_code == 1 and "too few correct or wrong detections of Car" in result.output
     assert path.read_bytes() == whole

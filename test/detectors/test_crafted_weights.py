@@ -14,7 +14,7 @@ from detection_samples import eager, frame, lively, make_detector, same, tiny
 from safetensors.torch import save
 
 from lidar_perception.detectors.checkpoint import KEY, Header, read_header
-from lidar_perception.detectors.pointnet.config import pointnet_config
+from lidar_perception.detectors.pointnet.config import make_pointnet_config
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointnet.network import make_pointnet
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
@@ -69,7 +69,7 @@ def mutated(header, rng):
 SMALL = {
     "pointpillars": (lambda: Header(tiny("v4"), {"steps": 1}, {"map": 0.5}, "abc"), lively,
                      load_detector, eager()),
-    "pointnet": (lambda: Header(pointnet_config(points=16, centroids=8, coarse=4,
+    "pointnet": (lambda: Header(make_pointnet_config(points=16, centroids=8, coarse=4,
                                                 neighbours=(4, 4, 4), coarse_neighbours=4)),
                  make_pointnet, load_pointnet_detector,
                  with_values(PointNetDetectorParams(), {"pointnet.warm_up": False})),

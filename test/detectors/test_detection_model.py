@@ -18,10 +18,10 @@ from lidar_perception.detectors.pointpillars.config import (
     SIZES,
     VERSIONS,
     NetworkConfig,
-    network_config,
+    make_config,
 )
 from lidar_perception.detectors.pointpillars.losses import detection_loss
-from lidar_perception.detectors.pointpillars.network import fused, make_network
+from lidar_perception.detectors.pointpillars.network import fuse_norms, make_network
 from lidar_perception.detectors.pointpillars.pillar_batch import (
     keep_first_per_cell,
     make_pillar_batch,
@@ -62,7 +62,7 @@ def some_map(config, seed=0) -> torch.Tensor | None:
 @each_version
 @pytest.mark.parametrize("size", SIZES)
 def test_a_config_survives_json(version, size):
-    config = network_config(version, size, classes=("Cyclist", "Car"))
+    config = make_config(version, size, classes=("Cyclist", "Car"))
     assert parse_config(NetworkConfig, dataclasses.asdict(config), "") == config
     assert config.classes == ("Cyclist", "Car") and config.grid == (496, 432)
 
@@ -77,7 +77,7 @@ def test_versions_are_those_of_the_paper():
 
 def test_the_full_baseline_has_as_many_weights_as_pointpillars():
     # 4.8 million: Lang et al. with three classes, six anchors and a direction
-    counted = sum(p.numel() for p in make_network(network_config("v0", "full")).parameters())
+    counted = sum(p.numel() for p in make_network(make_config("v0", "full")).parameters())
     by_hand = (9 * 64 + 2 * 64                                                 # points
                + sum(9 * a * b + n * 9 * b * b + 2 * b * (n + 1)               # blocks
                      for a, b, n in ((64, 64, 3), (64, 128, 5), (128, 256, 5)))
@@ -91,12 +91,12 @@ def test_the_full_baseline_has_as_many_weights_as_pointpillars():
     (dict(cell=0.17), "cannot be divided"), (dict(zero_row=True), "max_points")])
 def test_a_config_that_cannot_be_is_refused(change, words):
     with pytest.raises(InputError, match=words):
-        network_config(**{"version": "v1", **change})
+        make_config(**{"version": "v1", **change})
 
 
 def test_another_network_is_refused_with_both_values():
     with pytest.raises(InputError, match=r"f\.st .*version is v4, expected was v2"):
-        require_same_config(network_config("v4"), network_config("v2"), "f.st")
+        require_same_config(make_config("v4"), make_config("v2"), "f.st")
 
 
 # pillars
@@ -241,7 +241,7 @@ def test_folding_the_norms_changes_nothing(version):
     config = tiny(version)
     network = lively(config)
     pillars, cluster_map = make_pillar_batch([some_points(config)], config), some_map(config)
-    folded = fused(network)
+    folded = fuse_norms(network)
     for a, b in zip(network(pillars, cluster_map), folded(pillars, cluster_map)):
         torch.testing.assert_close(a, b, atol=2e-5, rtol=1e-4)
     assert not [m for m in folded.modules() if isinstance(m, torch.nn.BatchNorm2d)]
@@ -277,7 +277,7 @@ def test_a_tiny_network_learns_two_objects():
         optimizer.step()
         rate.step()
     with torch.no_grad():
-        out = fused(network)(make_pillar_batch([points], config))
+        out = fuse_norms(network)(make_pillar_batch([points], config))
     scores = torch.sigmoid(out.logits[0])
     for box, label in zip(BOXES, LABELS):
         best = scores[:, label].argmax()

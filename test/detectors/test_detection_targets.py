@@ -19,10 +19,10 @@ from lidar_perception.detectors.pointpillars.targets import (
     BACKGROUND,
     IGNORED,
     Targets,
-    anchors_near,
     assign,
     dense,
     encode,
+    find_near_anchors,
     nearest_axis_iou,
     sparse,
 )
@@ -120,12 +120,12 @@ def test_anchors_that_are_not_near_overlap_nothing(seed):
     anchors, kinds = anchor_tensors(config)
     boxes = torch.from_numpy(some_boxes(seed, 6, 12.0)).float()
     for index in range(len(config.anchors)):
-        near = anchors_near(anchors, config, boxes, index)
+        near = find_near_anchors(anchors, config, boxes, index)
         mine = torch.nonzero(kinds == index)[:, 0]
         assert torch.isin(near, mine).all() and (near.diff() > 0).all()
         others = mine[~torch.isin(mine, near)]
         assert not nearest_axis_iou(anchors[others], boxes).any()
-    assert len(anchors_near(anchors, config, boxes[:0], 0)) == 0
+    assert len(find_near_anchors(anchors, config, boxes[:0], 0)) == 0
 
 
 def test_every_object_has_an_anchor_and_the_order_of_objects_makes_no_difference():

@@ -15,8 +15,8 @@ from lidar_perception.clustering.shapes import classify_by_diagonal, fit_boxes, 
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.devices import CPU, find_device
 from lidar_perception.detectors.normalized_view import NormalizedView, to_sensor_frame
-from lidar_perception.detectors.pointpillars.config import VERSIONS, network_config
-from lidar_perception.detectors.pointpillars.expert import draw_clusters, network_input
+from lidar_perception.detectors.pointpillars.config import VERSIONS, make_config
+from lidar_perception.detectors.pointpillars.expert import draw_clusters, make_network_input
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND, STEPS
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.ground.params import SensorPoseParams
@@ -56,7 +56,7 @@ def test_versions_see_what_the_paper_says():
     for version in VERSIONS:
         config = tiny(version)
         seen = NormalizedView.of(scan, low=config.low, high=config.high).frame
-        inputs[version] = network_input(seen, config)
+        inputs[version] = make_network_input(seen, config)
     flat = segment_ground(seen, EXPERT_GROUND)
     assert [i.points.shape[1] for i in inputs.values()] == [4, 4, 5, 5, 4]
     assert [i.cluster_map is not None for i in inputs.values()] == [False] * 4 + [True]
@@ -169,7 +169,7 @@ def test_intensity_is_scaled_and_may_be_left_out():
     without = detector(replace(scan, intensity=None))
     assert "no intensity" in without.problem
     half = np.where(np.arange(len(scan)) % 2, np.float32(np.nan), scan.intensity)
-    assert "their intensity is not a number" in detector(replace(scan, intensity=half)).problem
+    assert "their intensity is NaN" in detector(replace(scan, intensity=half)).problem
     detector.params = with_values(detector.params, {"pointpillars.intensity_scale": 0.0})
     for blind in scan, replace(scan, intensity=None), replace(scan, intensity=half):
         assert same(detector(blind), without) and detector(blind).problem is None
@@ -271,6 +271,6 @@ def test_real_scans_of_any_version_go_through(data):
     from lidar_perception.data.open import open_recording
     scan = open_recording(data / "kitti_object").frames[0].load()
     for version in VERSIONS:
-        config = network_config(version, "compact")
+        config = make_config(version, "compact")
         found = make_detector(TorchNetwork(lively(config)), Header(config))(scan)
         assert found.problem is None and found.timings["network"] > 0

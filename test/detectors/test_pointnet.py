@@ -14,17 +14,21 @@ from lidar_perception.detectors.pointnet import config as config_module
 from lidar_perception.detectors.pointnet.box_head import BoxTargets, Outputs, decode, encode
 from lidar_perception.detectors.pointnet.calibration import calibrate, calibration_error
 from lidar_perception.detectors.pointnet.clusters import (
-    NEAR,
+    RADII_M,
     Clusters,
-    clusters_of,
-    ground_under,
-    network_input,
+    find_ground_heights,
+    make_clusters,
+    make_network_input,
 )
-from lidar_perception.detectors.pointnet.config import ABLATIONS, NETWORKS, pointnet_config
+from lidar_perception.detectors.pointnet.config import ABLATIONS, NETWORKS, make_pointnet_config
 from lidar_perception.detectors.pointnet.losses import cluster_loss
-from lidar_perception.detectors.pointnet.network import fused, make_pointnet, nearest
-from lidar_perception.detectors.pointnet.predict import found, predict, probabilities
-from lidar_perception.detectors.pointnet.torch_network import TorchPointNet, outputs_of
+from lidar_perception.detectors.pointnet.network import fuse_norms, make_pointnet, nearest
+from lidar_perception.detectors.pointnet.predict import (
+    compute_probabilities,
+    predict,
+    select_detections,
+)
+from lidar_perception.detectors.pointnet.torch_network import TorchPointNet, run_network
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
@@ -42,7 +46,7 @@ def rng():
 def network(name="improved", **changes):
     """One with weights, norms and all, that are not those of the beginning."""
     torch.manual_seed(3)
-    net = make_pointnet(pointnet_config(name, **{**SMALL, **changes})).eval()
+    net = make_pointnet(make_pointnet_config(name, **{**SMALL, **changes})).eval()
     for buffer_name, buffer in net.named_buffers():
         if "running" in buffer_name:
             buffer.copy_(torch.rand_like(buffer) + 0.1)
@@ -50,7 +54,7 @@ def network(name="improved", **changes):
 
 
 def called(net, clusters, **changes):
-    inputs = network_input(clusters, net.config.points)
+    inputs = make_network_input(clusters, net.config.points)
     with torch.inference_mode():
         return net(*(torch.from_numpy(changes.get(name, getattr(inputs, name)))
                      for name in ("points", "valid", "context")))
@@ -63,7 +67,7 @@ def test_clusters_are_the_points_of_each_number_in_their_order(rng):
     ids = rng.integers(-2, 6, 50)
     ids[ids == 4] = 5
     ids[:3] = 9, 9, 700
-    clusters = clusters_of(frame, ids, 2)
+    clusters = make_clusters(frame, ids, 2)
     assert clusters.ids.tolist() == [n for n in np.unique(ids) if n > 0 and (ids == n).sum() > 1]
     for i, number in enumerate(clusters.ids):
         own = clusters.points[clusters.first[i]:clusters.first[i + 1]]
@@ -71,25 +75,25 @@ def test_clusters_are_the_points_of_each_number_in_their_order(rng):
         assert np.array_equal(own[:, 3], frame.intensity[ids == number])
     some = clusters.take(np.array([2, 0]))
     assert np.array_equal(some.points[some.first[1]:], clusters.points[:clusters.first[1]])
-    none = clusters_of(frame, np.zeros(50, int))
-    assert len(none) == 0 and len(network_input(none, 8).points) == 0
-    plain = clusters_of(PointCloud(frame.xyz), ids, 2)
+    none = make_clusters(frame, np.zeros(50, int))
+    assert len(none) == 0 and len(make_network_input(none, 8).points) == 0
+    plain = make_clusters(PointCloud(frame.xyz), ids, 2)
     assert np.array_equal(plain.points[:, :3], clusters.points[:, :3])
     assert not plain.points[:, 3].any()
 
 
 def test_points_are_drawn_without_repeating_one_and_no_cluster_minds_its_neighbours(rng):
     clusters = blobs(rng, [1, 7, 24, 90, 400])
-    inputs = network_input(clusters, 24)
+    inputs = make_network_input(clusters, 24)
     assert inputs.valid.sum(axis=1).tolist() == [1, 7, 24, 24, 24]
     for i in range(len(clusters)):
         own = clusters.points[clusters.first[i]:clusters.first[i + 1], 3]
         drawn = inputs.points[i, inputs.valid[i], 3]
         assert len(np.unique(drawn)) == len(drawn) and np.isin(drawn, own).all()
         assert np.isin(inputs.points[i, :, 3], drawn).all()
-        alone = network_input(clusters.take(np.array([i])), 24)
+        alone = make_network_input(clusters.take(np.array([i])), 24)
         assert np.array_equal(alone.points[0], inputs.points[i])
-    other = network_input(clusters, 24, seed=1)
+    other = make_network_input(clusters, 24, seed=1)
     assert not np.array_equal(other.points[4], inputs.points[4])
     assert np.array_equal(other.context, inputs.context)
 
@@ -99,23 +103,23 @@ def test_the_ground_is_that_around_a_place_however_it_slopes(rng):
     flat[:, 2] = 0.05 * flat[:, 0] - 1.7
     flat = flat[np.hypot(flat[:, 0] - 10, flat[:, 1]) > 4]  # none near here, but farther on
     indices = np.array([[10.0, 0], [-20, 5], [30, -30], [39, 39], [500, 0], [9e4, 9e4]])
-    found = ground_under(flat.astype(np.float32), indices)
+    found = find_ground_heights(flat.astype(np.float32), indices)
     for place, height in zip(indices, found):
         apart = np.hypot(*(flat[:, :2] - place).T)
-        near = next((r for r in NEAR if (apart <= r).sum() >= 3), None)
+        near = next((r for r in RADII_M if (apart <= r).sum() >= 3), None)
         wanted = -SENSOR_HEIGHT if near is None else flat[apart <= near, 2].mean()
         assert height == pytest.approx(wanted, abs=1e-5)
     assert found[0] == pytest.approx(-1.2, abs=0.02) and found[4] == found[5] == -SENSOR_HEIGHT
-    assert len(ground_under(flat, np.zeros((0, 2)))) == 0
-    assert (ground_under(flat[:0], indices) == -SENSOR_HEIGHT).all()
+    assert len(find_ground_heights(flat, np.zeros((0, 2)))) == 0
+    assert (find_ground_heights(flat[:0], indices) == -SENSOR_HEIGHT).all()
     # heights are over it: a hill changes nothing
     clusters = replace(blobs(rng, [20, 30]), ground=np.array([-1.7, -1.5]))
     lifted = replace(clusters, points=clusters.points + np.float32([0, 0, 3, 0]),
                      ground=clusters.ground + 3)
-    here, there = network_input(clusters, 24), network_input(lifted, 24)
+    here, there = make_network_input(clusters, 24), make_network_input(lifted, 24)
     assert np.allclose(here.context, there.context, atol=1e-5)
     assert np.allclose(here.points, there.points, atol=1e-5)
-    assert np.allclose(network_input(clusters.take(np.array([1])), 24).context[0],
+    assert np.allclose(make_network_input(clusters.take(np.array([1])), 24).context[0],
                        here.context[1])
 
 
@@ -125,7 +129,7 @@ def test_wherever_a_cluster_lies_around_the_sensor_it_looks_the_same(rng):
     cos, sin = np.cos(turn), np.sin(turn)
     turned[:, 0] = cos * clusters.points[:, 0] - sin * clusters.points[:, 1]
     turned[:, 1] = sin * clusters.points[:, 0] + cos * clusters.points[:, 1]
-    here, there = (network_input(c, 24) for c in
+    here, there = (make_network_input(c, 24) for c in
                    (clusters, Clusters(turned, clusters.first, clusters.ids)))
     assert np.allclose(here.points, there.points, atol=1e-5)
     assert np.allclose(here.context, there.context, atol=1e-5)
@@ -155,7 +159,7 @@ def test_the_nearest_are_those_that_a_full_search_finds(rng):
 
 def test_groups_are_what_plain_loops_make_of_them(rng):
     net = network()
-    inputs = network_input(blobs(rng, [60, 5]), net.config.points)
+    inputs = make_network_input(blobs(rng, [60, 5]), net.config.points)
     points, valid = torch.from_numpy(inputs.points), torch.from_numpy(inputs.valid)
     with torch.inference_mode():
         features = net.points(points)
@@ -182,14 +186,14 @@ def test_groups_are_what_plain_loops_make_of_them(rng):
 def test_points_that_fill_up_a_cluster_change_nothing(rng, name):
     net = network(name)
     clusters = blobs(rng, [10, 12, 2, 24, 6, 7, 40])
-    inputs = network_input(clusters, net.config.points)
+    inputs = make_network_input(clusters, net.config.points)
     other = inputs.points.copy()
     for i in range(len(clusters)):
         real = np.flatnonzero(inputs.valid[i])
         other[i, len(real):] = inputs.points[i, rng.choice(real, net.config.points - len(real))]
     for mine, theirs in zip(called(net, clusters), called(net, clusters, points=other)):
         assert torch.allclose(mine, theirs, atol=1e-5)
-    for mine, theirs in zip(outputs_of(net, inputs, chunk=2), called(net, clusters)):  # left out
+    for mine, theirs in zip(run_network(net, inputs, chunk=2), called(net, clusters)):  # left out
         assert torch.allclose(mine, theirs, atol=1e-5)
     engine = TorchPointNet(net)
     again = predict(engine, clusters.take(np.array([2, 0])))
@@ -199,37 +203,37 @@ def test_points_that_fill_up_a_cluster_change_nothing(rng, name):
 def test_norms_go_into_the_layers_before_them(rng):
     clusters = blobs(rng, [40, 9, 3])
     before = called(network(), clusters)
-    for mine, theirs in zip(before, called(fused(network()), clusters)):
+    for mine, theirs in zip(before, called(fuse_norms(network()), clusters)):
         assert torch.allclose(mine, theirs, atol=1e-4)
 
 
 def test_every_switch_of_the_ablation_changes_the_network_or_the_clusters():
-    made = {name: pointnet_config(name) for name in ABLATIONS}
+    made = {name: make_pointnet_config(name) for name in ABLATIONS}
     known = {(c.clustering, c.groups, c.mrg, c.skip) for c in made.values()}
     assert len(known) == len(ABLATIONS)
     sizes = {name: sum(p.numel() for p in make_pointnet(config).parameters())
              for name, config in made.items()}
     assert sizes["base"] == sizes["dynamic-threshold"] < sizes["skip"] < sizes["msg-skip"] < (
         sizes["improved"])
-    assert pointnet_config("pointnet").groups == ()
-    assert len(pointnet_config("pointnet2").groups) == 1
+    assert make_pointnet_config("pointnet").groups == ()
+    assert len(make_pointnet_config("pointnet2").groups) == 1
     assert made["base"].clustering.euclidean.threshold == "fixed"
 
 
 def test_a_config_survives_json_and_what_cannot_be_is_said():
-    config = pointnet_config("pointnet2", points=64)
+    config = make_pointnet_config("pointnet2", points=64)
     assert parse_config(config_module.PointNetConfig, asdict(config), "") == config
     with pytest.raises(InputError, match="no network 'resnet'"):
-        pointnet_config("resnet")
+        make_pointnet_config("resnet")
     with pytest.raises(InputError, match="Bus"):
-        pointnet_config(classes=("Bus",), sizes=((1, 1, 1),))
+        make_pointnet_config(classes=("Bus",), sizes=((1, 1, 1),))
     with pytest.raises(InputError, match="length"):
-        pointnet_config(classes=("Car",))
+        make_pointnet_config(classes=("Car",))
     with pytest.raises(InputError, match="later version"):
         parse_config(config_module.PointNetConfig, {"wings": 2}, "")
     for wrong in dict(radii=(0.4, 0.2, 0.1)), dict(centroids=500), dict(neighbours=(1, 2)):
         with pytest.raises(InputError):
-            pointnet_config(**wrong)
+            make_pointnet_config(**wrong)
 
 
 # boxes and scores
@@ -244,9 +248,9 @@ def outputs_with(targets: BoxTargets, bins: int) -> Outputs:
 
 
 def test_decoding_undoes_encoding(rng):
-    config, count = pointnet_config(), 200
+    config, count = make_pointnet_config(), 200
     clusters = blobs(rng, [5] * count)
-    inputs = network_input(clusters, 8)
+    inputs = make_network_input(clusters, 8)
     kinds = rng.integers(0, 3, count)
     sizes = np.array(config.sizes)[kinds] * np.exp(rng.uniform(-1.5, 1.5, (count, 3)))
     boxes = np.column_stack([inputs.centres + rng.normal(size=(count, 3)), sizes,
@@ -260,8 +264,8 @@ def test_decoding_undoes_encoding(rng):
 
 
 def test_the_loss_is_least_where_everything_is_right_and_asks_no_box_of_background(rng):
-    config = pointnet_config()
-    inputs = network_input(blobs(rng, [5] * 6), 8)
+    config = make_pointnet_config()
+    inputs = make_network_input(blobs(rng, [5] * 6), 8)
     boxes = np.column_stack([inputs.centres, np.full((6, 3), 1.5), np.linspace(-3, 3, 6)])
     targets = encode(boxes, np.zeros(6, int), inputs.centres, inputs.azimuths, config)
     labels = torch.tensor([0, 0, 0, 0, 3, -1])
@@ -289,7 +293,7 @@ def test_calibration_makes_scores_as_often_right_as_they_say(rng):
     logits = truth * 4 + torch.tensor([2.0, 0, 0, 0])  # too sure, and partial to one class
     before = calibration_error(torch.softmax(logits, 1).numpy(), labels.numpy())
     calibrate(net, logits, labels)
-    after = calibration_error(probabilities(*(x.numpy() for x in (
+    after = calibration_error(compute_probabilities(*(x.numpy() for x in (
         logits, net.temperature, net.offsets))), labels.numpy())
     assert after < 0.03 < 0.1 < before
     assert net.temperature.item() == pytest.approx(4, rel=0.1)
@@ -301,13 +305,13 @@ def test_calibration_makes_scores_as_often_right_as_they_say(rng):
 
 
 def test_of_boxes_on_the_same_object_the_best_is_kept(rng):
-    config = pointnet_config()
+    config = make_pointnet_config()
     predictions = predict(TorchPointNet(network()), blobs(rng, [20] * 4))
     boxes = np.tile(np.array([5, 5, 0, 4, 2, 1.5, 0.3], np.float32), (4, 1))
     boxes[3, 0] += 20
     probabilities = np.array([[0.6, 0, 0, 0.4], [0.9, 0, 0, 0.1], [0.1, 0, 0, 0.9],
                               [0.5, 0, 0, 0.5]], np.float32)
     made = predictions.__class__(probabilities, np.zeros(4, int), boxes)
-    kept = found(made, config, (0.3, 0.3, 0.3))
+    kept = select_detections(made, config, (0.3, 0.3, 0.3))
     assert kept.scores.tolist() == pytest.approx([0.9, 0.5])
-    assert len(found(made, config, (0.95, 0, 0))) == 0
+    assert len(select_detections(made, config, (0.95, 0, 0))) == 0

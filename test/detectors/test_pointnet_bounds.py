@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pointnet_samples import eager, random_detector
 
-from lidar_perception.detectors.pointnet.clusters import ground_under
+from lidar_perception.detectors.pointnet.clusters import find_ground_heights
 from lidar_perception.detectors.pointnet.torch_network import CHUNK
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import PointCloud
@@ -32,7 +32,7 @@ def test_small_and_large_clusters_and_many_are_no_trouble():
                      cluster_ids=np.repeat(np.arange(5000), 6) + 1)
     assert sum(batches) == 4000 and max(batches) <= CHUNK
     assert len(found.detections) == detector.params.pointnet.nms.max_boxes
-    assert "1000 of 5000 clusters are left out" in found.problem
+    assert "farthest 1000 of 5000 clusters are ignored" in found.problem
 
 
 def test_of_too_many_clusters_the_nearest_are_looked_at_and_the_others_counted():
@@ -49,7 +49,7 @@ def test_of_too_many_clusters_the_nearest_are_looked_at_and_the_others_counted()
             frame, ground=ground, cluster_ids=wanted)
     few = with_values(eager(), {"pointnet.max_clusters": 40})
     capped, everything = detected(few), detected(eager())
-    assert "260 of 300 clusters are left out" in capped.problem
+    assert "farthest 260 of 300 clusters are ignored" in capped.problem
     assert "left out" not in (everything.problem or "")
     means = np.add.reduceat(xyz, np.arange(0, 1800, 6)) / 6
     nearest = np.argsort(np.hypot(means[:, 0], means[:, 1]))[:40] + 1
@@ -62,6 +62,7 @@ def test_the_ground_is_found_under_each_cluster_however_far_another_one_is():
     rng = np.random.default_rng(1)
     ground = rng.uniform([-40, -40, -1.8], [40, 40, -1.6], (5000, 3)).astype(np.float32)
     places = rng.uniform(-30, 30, (50, 2))
-    near = ground_under(ground, places)
+    near = find_ground_heights(ground, places)
     far = np.array([[9e4, -9e4], [-9e4, 9e4]])
-    np.testing.assert_array_equal(ground_under(ground, np.concatenate([places, far]))[:50], near)
+    both = find_ground_heights(ground, np.concatenate([places, far]))
+    np.testing.assert_array_equal(both[:50], near)

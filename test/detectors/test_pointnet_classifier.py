@@ -10,7 +10,7 @@ from candidate_samples import boxes_at, scene
 from pointnet_samples import random_detector
 
 from lidar_perception.detectors.pointnet.classifier import BOX_MARGIN_M
-from lidar_perception.detectors.pointnet.clusters import points_of
+from lidar_perception.detectors.pointnet.clusters import crop_boxes
 from lidar_perception.detectors.pointnet.predict import predict
 from lidar_perception.geometry import points_in_box
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, PointCloud
@@ -35,23 +35,23 @@ def proposals():
 
 
 def test_clusters_are_points_in_each_box(frame, proposals):
-    made = points_of(proposals.boxes, frame, 0.2)
+    made = crop_boxes(proposals.boxes, frame, 0.2)
     assert len(made) == len(proposals) and made.sizes[3] < 5 < made.sizes[:3].min()
     for i, box in enumerate(proposals.boxes):
         part, inside = made.points[made.first[i]:made.first[i + 1]], points_in_box(
             frame.xyz, box, 0.2)
         np.testing.assert_array_equal(part[:, :3], frame.xyz[inside])
         np.testing.assert_array_equal(part[:, 3], frame.intensity[inside])
-    dark = points_of(proposals.boxes, replace(frame, intensity=None), 0.2)
+    dark = crop_boxes(proposals.boxes, replace(frame, intensity=None), 0.2)
     assert not dark.points[:, 3].any() and (dark.first == made.first).all()
-    assert len(points_of(proposals.boxes[:0], frame, 0.2)) == 0
+    assert len(crop_boxes(proposals.boxes[:0], frame, 0.2)) == 0
 
 
 def test_classifier_judges_each_proposal_by_itself(frame, proposals):
     classifier, ground = random_detector().classifier, np.zeros((0, 3), np.float32)
     every = np.ones(len(proposals), bool)
     probabilities, boxes = classifier.classify(proposals, frame, ground, every)
-    predictions = predict(classifier.network, points_of(proposals.boxes[:3], frame, BOX_MARGIN_M))
+    predictions = predict(classifier.network, crop_boxes(proposals.boxes[:3], frame, BOX_MARGIN_M))
     columns = [classifier.classes.index(CLASSES[i]) for i in proposals.class_ids[:3]]
     np.testing.assert_allclose(probabilities[:3], predictions.probabilities[np.arange(3), columns],
                                atol=1e-6)

@@ -7,16 +7,16 @@ import pytest
 import torch
 from pointnet_samples import blobs, lively, random_detector, small
 
-from lidar_perception.detectors.layer_weights import arrays_of
+from lidar_perception.detectors.layer_weights import to_arrays
 from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet import compiled
-from lidar_perception.detectors.pointnet.clusters import network_input
+from lidar_perception.detectors.pointnet.clusters import make_network_input
 from lidar_perception.detectors.pointnet.compiled import CompiledPointNet
-from lidar_perception.detectors.pointnet.config import NETWORKS, pointnet_config
-from lidar_perception.detectors.pointnet.network import fused
+from lidar_perception.detectors.pointnet.config import NETWORKS, make_pointnet_config
+from lidar_perception.detectors.pointnet.network import fuse_norms
 from lidar_perception.detectors.pointnet.predict import predict
-from lidar_perception.detectors.pointnet.torch_network import outputs_of
+from lidar_perception.detectors.pointnet.torch_network import run_network
 from lidar_perception.runs.threads import set_thread_count
 
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.skipif(
@@ -27,14 +27,14 @@ TOLERANCE = 1e-4  # of numbers whose sizes are about 1 to 20
 
 
 def compiled_network(network):
-    return CompiledPointNet(network.config, arrays_of(network))
+    return CompiledPointNet(network.config, to_arrays(network))
 
 
 def assert_equal(config, clusters, seed=0):
     network = lively(config, seed)
-    inputs = network_input(clusters, config.points)
+    inputs = make_network_input(clusters, config.points)
     with torch.inference_mode():
-        found, wanted = compiled_network(network)(inputs), outputs_of(network, inputs)
+        found, wanted = compiled_network(network)(inputs), run_network(network, inputs)
     for ours, theirs in zip(found, wanted):
         assert ours.shape == theirs.shape
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=TOLERANCE)
@@ -54,7 +54,7 @@ def test_every_network_equals_torch(name, spread):
          head_channels=(5,), classes=("Car",), sizes=((3.9, 1.6, 1.5),), yaw_bins=5)])
 def test_other_widths_equal_torch(changes):
     rng = np.random.default_rng(1)
-    assert_equal(pointnet_config(**changes), blobs(rng, SIZES))
+    assert_equal(make_pointnet_config(**changes), blobs(rng, SIZES))
 
 
 def test_clusters_do_not_depend_on_those_around_them(monkeypatch):
@@ -70,15 +70,16 @@ def test_clusters_do_not_depend_on_those_around_them(monkeypatch):
     np.testing.assert_array_equal(again.probabilities, whole.probabilities)
     np.testing.assert_array_equal(again.boxes, whole.boxes)
     assert len(predict(network, clusters.take(np.zeros(0, int))).boxes) == 0
-    assert all(len(x) == 0 for x in network(network_input(clusters.take(np.zeros(0, int)), 32)))
+    nothing = make_network_input(clusters.take(np.zeros(0, int)), 32)
+    assert all(len(x) == 0 for x in network(nothing))
 
 
 @pytest.mark.parametrize("name", ["points.0.0.weight", "local.nets.1.0.0.weight",
                                   "coarse.net.0.0.weight", "fine.0.0.bias"])
 def test_weights_that_are_no_numbers_are_no_answer(name):
-    network = fused(lively(small()))
+    network = fuse_norms(lively(small()))
     network.get_parameter(name).view(-1)[0] = torch.nan
-    inputs = network_input(blobs(np.random.default_rng(3), SIZES), 32)
+    inputs = make_network_input(blobs(np.random.default_rng(3), SIZES), 32)
     assert np.isnan(compiled_network(network)(inputs).logits).all()
 
 

@@ -371,7 +371,7 @@ def test_evaluation_runs_either_network(saved, tmp_path):
 def test_weights_that_do_not_come_with_the_package_are_asked_for(saved, tmp_path, monkeypatch):
     path, _, _ = saved
     monkeypatch.setattr(weights_module, "WEIGHTS", tmp_path / "own.safetensors")
-    with pytest.raises(InputError, match="no PointNet weights come with the package"):
+    with pytest.raises(InputError, match="the package has no PointNet weights"):
         load_pointnet_detector()
     named = with_values(eager(), {"pointnet.weights": str(path)})
     expected = random_detector()(frame())

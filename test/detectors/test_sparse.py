@@ -13,16 +13,16 @@ from detection_samples import lively, make_detector, random_detector, same, tiny
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.checkpoint import Header
-from lidar_perception.detectors.layer_weights import arrays_of
+from lidar_perception.detectors.layer_weights import to_arrays
 from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.parallel import run_in_parts
 from lidar_perception.detectors.params import NmsParams
 from lidar_perception.detectors.pointpillars import sparse
-from lidar_perception.detectors.pointpillars.config import network_config
+from lidar_perception.detectors.pointpillars.config import make_config
 from lidar_perception.detectors.pointpillars.expert import NetworkInput
 from lidar_perception.detectors.pointpillars.pillars import Pillars, make_pillars
-from lidar_perception.detectors.pointpillars.sparse_layers import dilated, shrunk
+from lidar_perception.detectors.pointpillars.sparse_layers import dilate, shrink
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.threads import set_thread_count
@@ -47,7 +47,7 @@ def strong(config, seed=0):
 
 
 def sparse_network(network):
-    return sparse.SparseNetwork(network.pillar_net.config, arrays_of(network))
+    return sparse.SparseNetwork(network.pillar_net.config, to_arrays(network))
 
 
 def inputs(config, points, drawn, seed=0, share=1.0):
@@ -103,7 +103,7 @@ def test_small_network_equals_torch(version, points, drawn):
                            block_layers=(0, 2), map_channels=(6,), pillar_channels=10)),
 ])
 def test_shipped_sizes_equal_torch_also_at_the_border(version, size, changes):
-    config = network_config(version, size, **changes)
+    config = make_config(version, size, **changes)
     few = assert_equal(config, 12, 0.001, share=0.1)
     none = assert_equal(config, 0, 0.0)
     changed = np.abs(few - none).max(axis=1)
@@ -111,14 +111,14 @@ def test_shipped_sizes_equal_torch_also_at_the_border(version, size, changes):
 
 
 def test_head_is_evaluated_near_points_only():
-    config = network_config("v4", "compact", **WIDE)
+    config = make_config("v4", "compact", **WIDE)
     assert_equal(config, 10, 0.0, reach=sparse.REACH)
     pillars, maps = inputs(config, 10, 0.0)
     network = sparse_network(strong(config))
     prediction = network(pillars, maps)
     occupied = np.zeros(config.grid, bool)
     occupied.ravel()[pillars.cells] = True
-    rows, columns = np.nonzero(shrunk(occupied, 2))
+    rows, columns = np.nonzero(shrink(occupied, 2))
     height, width = config.head_grid
     away = np.maximum(np.abs(np.arange(height)[:, None, None] - rows),
                       np.abs(np.arange(width)[:, None] - columns)).min(axis=2)
@@ -140,7 +140,7 @@ def test_boxes_equal_torch_at_any_anchors():
 
 def test_threads_and_earlier_clouds_change_nothing(monkeypatch):
     monkeypatch.setattr(sparse, "MIN_PER_PART", 1000)
-    config = network_config("v4", "compact", **WIDE)
+    config = make_config("v4", "compact", **WIDE)
     network = sparse_network(strong(config))
     first, second = inputs(config, 50, 0.001), inputs(config, 3000, 0.05, seed=1)
     alone = network(*first)
@@ -184,7 +184,7 @@ def test_networks_that_torch_must_run(monkeypatch):
                           (tiny("v1", neck="deconv"), "neck"),
                           (tiny("v1", max_points=4, zero_row=True), "rows of zeros")]:
         network = lively(config)
-        assert words in sparse.unsupported(network.pillar_net.config)
+        assert words in sparse.find_unsupported_part(network.pillar_net.config)
         assert TorchNetwork(network, engine="auto").sparse is None
         with pytest.raises(InputError, match=f"{words}.*; choose the engine auto or torch"):
             TorchNetwork(network, engine="sparse")
@@ -193,7 +193,7 @@ def test_networks_that_torch_must_run(monkeypatch):
     with pytest.raises(InputError, match="16 bits"):
         TorchNetwork(network, amp="bf16", engine="sparse")
     monkeypatch.setattr(sparse, "LANES", 0)
-    assert "AVX2" in sparse.unsupported(network.pillar_net.config)
+    assert "AVX2" in sparse.find_unsupported_part(network.pillar_net.config)
     assert TorchNetwork(network, engine="auto").sparse is None
 
 
@@ -306,4 +306,4 @@ def test_dilation_grows_along_both_axes():
     mask[0, 6] = mask[5, 2] = True
     wanted = np.zeros_like(mask)
     wanted[:3, 4:] = wanted[3:8, :5] = True
-    np.testing.assert_array_equal(dilated(mask, 2), wanted)
+    np.testing.assert_array_equal(dilate(mask, 2), wanted)

@@ -21,7 +21,7 @@ from lidar_perception.detectors.checkpoint import (
     save_checkpoint,
 )
 from lidar_perception.detectors.pointpillars import weights_file as weights_module
-from lidar_perception.detectors.pointpillars.config import NetworkConfig, network_config
+from lidar_perception.detectors.pointpillars.config import NetworkConfig, make_config
 from lidar_perception.detectors.pointpillars.detector import load_detector
 from lidar_perception.detectors.pointpillars.import_weights import import_weights
 from lidar_perception.detectors.pointpillars.network import load_network, make_network
@@ -224,7 +224,7 @@ def theirs(state, project):
 @pytest.fixture(scope="module")
 def big():
     """A v0 full network as those projects have it, with ten inputs for each point."""
-    return lively(network_config("v0", "full", middle_z=True)).state_dict()
+    return lively(make_config("v0", "full", middle_z=True)).state_dict()
 
 
 @pytest.mark.parametrize("project, wrapped", [

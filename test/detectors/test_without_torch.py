@@ -11,7 +11,7 @@ import torch
 from detection_samples import lively, tiny
 
 from lidar_perception.detectors.checkpoint import Header, read_arrays, save_checkpoint
-from lidar_perception.detectors.layer_weights import LayerWeights, Misfit, arrays_of
+from lidar_perception.detectors.layer_weights import LayerWeights, Misfit, to_arrays
 from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
@@ -47,7 +47,7 @@ def test_detecting_does_not_load_torch():
     lambda tensors: tensors.update({"head.scores.bias": np.zeros(18, np.int64)})])
 def test_tensors_of_another_network_are_refused(change):
     config = tiny("v4")
-    tensors = arrays_of(lively(config))
+    tensors = to_arrays(lively(config))
     SparseNetwork(config, tensors)
     change(tensors)
     with pytest.raises(Misfit):
@@ -59,7 +59,7 @@ def test_folded_norm_equals_layer_and_norm():
     layer, norm = torch.nn.Conv2d(5, 7, 3, bias=False), torch.nn.BatchNorm2d(7, eps=0.01).eval()
     for values in norm.weight, norm.bias, norm.running_mean, norm.running_var:
         values.data.uniform_(0.5, 2)
-    weight, bias = LayerWeights(arrays_of(torch.nn.Sequential(layer, norm)), 0.01).take(
+    weight, bias = LayerWeights(to_arrays(torch.nn.Sequential(layer, norm)), 0.01).take(
         "0", (7, 5, 3, 3), "1")
     image = torch.from_numpy(rng.normal(size=(1, 5, 6, 6)).astype(np.float32))
     torch.testing.assert_close(

@@ -8,7 +8,7 @@ import torch
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
-from lidar_perception.detectors.pointpillars.config import NetworkConfig, network_config
+from lidar_perception.detectors.pointpillars.config import NetworkConfig, make_config
 from lidar_perception.detectors.pointpillars.detector import CPU, PointPillarsDetector
 from lidar_perception.detectors.pointpillars.network import make_network
 from lidar_perception.detectors.pointpillars.params import DetectorParams
@@ -28,7 +28,7 @@ def tiny(version: str = "v0", **changes) -> NetworkConfig:
     small = dict(low=(0.0, -5.12, -3.0), high=(10.24, 5.12, 1.0), cell=0.32, pillar_channels=8,
                  map_channels=(4, 8), block_channels=(8, 12, 16), block_layers=(1, 1, 1),
                  deconv_channels=8, fpn_channels=8)
-    return network_config(version, "compact", **{**small, **changes})
+    return make_config(version, "compact", **{**small, **changes})
 
 
 def anchor_tensors(config: NetworkConfig) -> tuple[torch.Tensor, torch.Tensor]:

@@ -8,9 +8,9 @@ import torch
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.clusters import Clusters
-from lidar_perception.detectors.pointnet.config import PointNetConfig, pointnet_config
+from lidar_perception.detectors.pointnet.config import PointNetConfig, make_pointnet_config
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
-from lidar_perception.detectors.pointnet.network import CONTEXT, PointNet, fused, make_pointnet
+from lidar_perception.detectors.pointnet.network import CONTEXT, PointNet, fuse_norms, make_pointnet
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
 from lidar_perception.detectors.pointnet.torch_network import TorchPointNet
 from lidar_perception.param_fields import with_values
@@ -23,7 +23,7 @@ SMALL = dict(points=32, centroids=12, coarse=4, neighbours=(4, 6, 8), coarse_nei
 
 def small(name: str = "improved", **changes) -> PointNetConfig:
     """Any network with a few channels."""
-    return pointnet_config(name, **{**SMALL, **changes})
+    return make_pointnet_config(name, **{**SMALL, **changes})
 
 
 def lively(config: PointNetConfig, seed: int = 0) -> PointNet:
@@ -56,7 +56,7 @@ def eager(params: PointNetDetectorParams = PointNetDetectorParams(),
 
 def make_classifier(network: PointNet, header: Header, engine: str = "auto") -> PointNetClassifier:
     """For inference."""
-    return PointNetClassifier(TorchPointNet(fused(network), engine), header)
+    return PointNetClassifier(TorchPointNet(fuse_norms(network), engine), header)
 
 
 def random_detector(params: PointNetDetectorParams | None = None,

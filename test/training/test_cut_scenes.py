@@ -15,7 +15,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.pointnet.clusters import Clusters
-from lidar_perception.detectors.pointnet.config import pointnet_config
+from lidar_perception.detectors.pointnet.config import make_pointnet_config
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointnet.network import make_pointnet
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
@@ -59,7 +59,7 @@ from lidar_perception.types import (
 )
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-CONFIG = pointnet_config(**SMALL)
+CONFIG = make_pointnet_config(**SMALL)
 STILL = ClusterAugmentParams(box_shift=0, farther=0, dropout=0, beam_noise=0, range_noise=0,
                              scale=0, flip=0, intensity=0, height=0, things_stretch=0,
                              things_intensity=0, things_shine=0)
@@ -228,7 +228,7 @@ def test_scene_is_cut_by_clustering_and_around_objects(rng, tmp_path):
     assert np.array_equal(first.clusters.points, again.clusters.points)
     next(tmp_path.iterdir()).write_bytes(b"broken")
     assert np.array_equal(source.scene(0).labels, first.labels)
-    other = CutScenes(RepeatedScene(scene), pointnet_config("base"), 5, tmp_path)
+    other = CutScenes(RepeatedScene(scene), make_pointnet_config("base"), 5, tmp_path)
     other.scene(0)
     assert len(list(tmp_path.iterdir())) == 2  # another configuration
 

@@ -19,7 +19,7 @@ from samples import WALKER
 from training_toy import STILL, broken_folder, prepare_all
 
 from lidar_perception.detectors.contract import DetectionResult
-from lidar_perception.detectors.pointpillars.config import RANGES, network_config
+from lidar_perception.detectors.pointpillars.config import RANGES, make_config
 from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED, dense
 from lidar_perception.geometry import is_within, wrap_angle
 from lidar_perception.simulation import drive
@@ -213,7 +213,7 @@ def test_validation_scores_perfect_and_blind_detectors(tmp_path):
 
 @pytest.mark.parametrize("view", ["ahead", "around"])
 def test_validation_without_camera_keeps_labels_in_range(view):
-    config = network_config("v0", "compact", **(RANGES["around"] if view == "around" else {}))
+    config = make_config("v0", "compact", **(RANGES["around"] if view == "around" else {}))
     source = SimulatedScenes(7, 1, SENSOR, Scenes(None, 3.0, "campus"))
     known = source.frame(0).truth()
     truth = load_validation_frame(config, source, 0).truth()
@@ -306,7 +306,7 @@ def test_labels_in_turned_camera_equal_those_of_turned_scene(quarter):
 
 
 def test_reduced_range_around_keeps_all_directions():
-    around = network_config("v0", "compact", **RANGES["around"])
+    around = make_config("v0", "compact", **RANGES["around"])
     part = reduce_range(around, 30.0, 20.0)
     assert part.low[:2] == pytest.approx((-30.72, -20.48)) and part.high[:2] == pytest.approx(
         (30.72, 20.48))

@@ -40,7 +40,7 @@ from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams, PointNetParams
 from lidar_perception.detectors.pointpillars.detector import load_detector
-from lidar_perception.detectors.pointpillars.expert import experts
+from lidar_perception.detectors.pointpillars.expert import run_experts
 from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
 from lidar_perception.detectors.trained_network import TrainedNetwork
@@ -138,7 +138,7 @@ class FusedDetector(NetworkDetector):
         with ThreadPoolExecutor(1) as pool:
             clusters = pool.submit(cluster_obstacles, view.frame.xyz, is_ground, params.people,
                                    frame.xyz)
-            columns = experts(view.frame, config, is_ground, view.take(cluster_ids),
+            columns = run_experts(view.frame, config, is_ground, view.take(cluster_ids),
                               params.ground, params.clustering)
             found = self.proposer.propose(
                 view, *columns, ScoreParams.for_all_classes(settings.proposals),

@@ -1,8 +1,8 @@
-"""Boxes as the numbers that the network gives, and back (paper C, Eq. 18 and 19).
+"""Encoding of boxes as network outputs, and decoding (paper C, Eq. 19).
 
-In the frame of clusters.py, straight ahead: the centre of the whole object from the mean of the
-points that were seen, metres; log of l w h over the class's mean; yaw as a bin and the rest of it,
-in halves of a bin, -1 .. 1.
+In the normalized frame of clusters.py, a box is: the centre of the object relative to the mean of
+its points, metres; the log of length, width and height relative to the mean of the class; yaw as a
+bin and a residual, -1..1, in units of half a bin.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from lidar_perception.detectors.pointnet.clusters import ClusterInput
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.geometry import wrap_angle
 
-Array = TypeVar("Array")  # of NumPy or torch
+Array = TypeVar("Array")  # NumPy array or torch tensor
 
 
 class Outputs(NamedTuple, Generic[Array]):
-    """The output of a network for B clusters: logits (B, K + 1), background last; centres (B, 3),
-    sizes (B, 3), yaw_bins (B, Y) and yaw_residuals (B, Y) as above, Y bins."""
+    """Output of a network for B clusters: logits (B, K + 1) with the background last; centres
+    (B, 3), sizes (B, 3), yaw_bins (B, Y) and yaw_residuals (B, Y), with Y bins."""
 
     logits: Array
     centres: Array
@@ -30,7 +30,8 @@ class Outputs(NamedTuple, Generic[Array]):
 
 
 class BoxTargets(NamedTuple, Generic[Array]):
-    """centres (K, 3), sizes (K, 3), yaw_residuals (K,) float32, yaw_bins (K,) int64."""
+    """Encoded boxes: centres (K, 3), sizes (K, 3) and yaw_residuals (K,) float32, yaw_bins (K,)
+    int64."""
 
     centres: Array
     sizes: Array
@@ -40,8 +41,12 @@ class BoxTargets(NamedTuple, Generic[Array]):
 
 def encode(boxes: np.ndarray, labels: np.ndarray, centres: np.ndarray, azimuths: np.ndarray,
            config: PointNetConfig) -> BoxTargets[np.ndarray]:
-    """Targets of boxes (K, 7) of classes labels (K,) into config.classes, for clusters with these
-    centres (K, 3) and azimuths (K,)."""
+    """Encode boxes (K, 7) relative to their clusters.
+
+    Args:
+        labels: (K,) indices into config.classes.
+        centres, azimuths: (K, 3) and (K,) of the clusters, see ClusterInput.
+    """
     offset = boxes[:, :3] - centres
     cos, sin = np.cos(azimuths), np.sin(azimuths)
     turned = np.column_stack([cos * offset[:, 0] + sin * offset[:, 1],
@@ -57,7 +62,7 @@ def encode(boxes: np.ndarray, labels: np.ndarray, centres: np.ndarray, azimuths:
 
 def decode(outputs: Outputs[np.ndarray], inputs: ClusterInput, config: PointNetConfig,
            labels: np.ndarray) -> np.ndarray:
-    """(K, 7) float32 boxes, if cluster i is of class labels[i]: the inverse of encode."""
+    """Return boxes (K, 7) float32 for classes labels (K,), the inverse of encode."""
     centres, logs, residuals = (x.astype(np.float64) for x in
                                 (outputs.centres, outputs.sizes, outputs.yaw_residuals))
     bins = outputs.yaw_bins.argmax(axis=1)

@@ -1,4 +1,4 @@
-"""Scores that mean what they say: 0.8 is right four times of five (Guo et al., ICML 2017)."""
+"""Temperature calibration: a score of 0.8 is correct in 80 % of cases (Guo et al., ICML 2017)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,14 @@ STEPS = 60
 
 
 def calibrate(network: PointNet, logits: Tensor, labels: Tensor) -> None:
-    """Set the network's temperature and offsets so that its probabilities fit labels (B,) int64 of
-    logits (B, K + 1) best; labels below 0 do not count. Without labels nothing changes. Offsets
-    make up for classes that are rarer in the street than in training."""
+    """Fit the network's temperature and offsets to labels, in place.
+
+    The offsets compensate for classes that are rarer on real roads than in training.
+
+    Args:
+        logits: (B, K + 1).
+        labels: (B,) int64; negative labels are ignored. Without other labels nothing changes.
+    """
     known = labels >= 0
     if not known.any():
         return
@@ -28,7 +33,7 @@ def calibrate(network: PointNet, logits: Tensor, labels: Tensor) -> None:
     def loss() -> Tensor:
         optimizer.zero_grad()
         scaled = logits / log_temperature.clamp(-3, 3).exp() + offsets
-        # A class that nobody has would go to minus infinity.
+        # Regularization: the offset of a class without examples would go to minus infinity.
         value = functional.cross_entropy(scaled, labels) + 1e-3 * offsets.square().sum()
         value.backward()
         return value
@@ -39,8 +44,14 @@ def calibrate(network: PointNet, logits: Tensor, labels: Tensor) -> None:
 
 
 def calibration_error(probabilities: np.ndarray, labels: np.ndarray, bins: int = 10) -> float:
-    """Expected calibration error: the mean gap of the likeliest class's probability and how often
-    it is right, in bins of equal width; probabilities (B, K), labels (B,). 0 without any."""
+    """Return the expected calibration error, in bins of equal width.
+
+    It is the mean difference between the highest probability and the accuracy; 0 without examples.
+
+    Args:
+        probabilities: (B, K).
+        labels: (B,).
+    """
     best = probabilities.max(axis=1)
     right = probabilities.argmax(axis=1) == labels
     bin_of = np.minimum((best * bins).astype(int), bins - 1)

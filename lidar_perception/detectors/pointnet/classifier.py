@@ -1,4 +1,4 @@
-"""PointNet in inference mode: it classifies clusters, and boxes that another network proposes."""
+"""PointNet in inference mode: classification of clusters and of boxes from another network."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import numpy as np
 
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.devices import CPU
-from lidar_perception.detectors.pointnet.clusters import Clusters, points_of
+from lidar_perception.detectors.pointnet.clusters import Clusters, crop_boxes
 from lidar_perception.detectors.pointnet.predict import Network, Predictions, predict
 from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.types import CLASSES, Detections, PointCloud
 
-BOX_MARGIN_M = 0.2  # around a box: points in it are classified
-MIN_POINTS = 3      # in a box that is classified
+BOX_MARGIN_M = 0.2  # points up to this distance from a box are classified with it
+MIN_POINTS = 3      # boxes with fewer points are not classified
 
 
 class PointNetClassifier(TrainedNetwork):
@@ -30,25 +30,26 @@ class PointNetClassifier(TrainedNetwork):
 
     def classify(self, proposals: Detections, obstacles: PointCloud, ground: np.ndarray,
                  selected: np.ndarray, cpu_fallback: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """Judge boxes of a NormalizedView by the points in them.
+        """Classify the points in boxes of a NormalizedView.
 
         Args:
             proposals: K boxes with their classes; K may be 0. The result for one does not depend
                 on the others.
             obstacles: the points of the view that are not ground.
             ground: (G, 3) xyz of the ground points of the view.
-            selected: (K,) bool, the proposals to judge. Skipped are also those of classes that the
-                network does not have and those with fewer than MIN_POINTS points.
+            selected: (K,) bool, the proposals to classify. Proposals with a class that the network
+                does not have, or with fewer than MIN_POINTS points, are skipped too.
 
         Returns:
-            Probabilities (K,) that each proposal is of its class, and the boxes (K, 7) that its
-            points suggest, both float64 and NaN for skipped proposals.
+            Probability (K,) that each proposal has its class, and a box (K, 7) from its points,
+            both float64 and NaN for skipped proposals.
         """
-        clusters = points_of(proposals.boxes, obstacles, BOX_MARGIN_M)
+        clusters = crop_boxes(proposals.boxes, obstacles, BOX_MARGIN_M)
         index_of = {CLASSES.index(name): i for i, name in enumerate(self.classes)}
         labels = np.array([index_of.get(int(i), -1) for i in proposals.class_ids], np.int64)
         chosen = np.flatnonzero(selected & (clusters.sizes >= MIN_POINTS) & (labels >= 0))
-        predictions = self.predict(clusters.take(chosen).on(ground), labels[chosen], cpu_fallback)
+        predictions = self.predict(clusters.take(chosen).with_ground(ground), labels[chosen],
+                                   cpu_fallback)
         count = len(proposals)
         probabilities, boxes = np.full(count, np.nan), np.full((count, 7), np.nan)
         probabilities[chosen], boxes[chosen] = predictions.scores, predictions.boxes

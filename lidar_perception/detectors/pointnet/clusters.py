@@ -1,8 +1,8 @@
-"""Clusters of a cloud, and what the network reads of them.
+"""Clusters of a cloud, and the network inputs made from them.
 
-Every cluster is seen from the same side: moved to its mean, and turned about the sensor until it
-lies straight ahead, so that no heading of the cloud matters and the network learns from where a
-thing is seen.
+Clusters are normalized: moved to their mean, and rotated about the sensor until they are straight
+ahead. The result does not depend on the heading of the cloud, and the network learns from which
+side it sees an object.
 """
 
 from __future__ import annotations
@@ -17,17 +17,22 @@ from lidar_perception.groups import group_by_id
 from lidar_perception.types import SENSOR_HEIGHT, PointCloud
 
 POINT, CONTEXT = 5, 6  # numbers that the network reads of a point, and of a whole cluster
-NEAR = (3.0, 6.0, 12.0)  # m: so far around a cluster the ground is looked for
-FEWEST = 3               # points of it
-CELLS = 64               # of NEAR[0] m along x and y, then they begin anew: far places share them
+RADII_M = (3.0, 6.0, 12.0)  # of the search for ground around a cluster, one after the other
+MIN_GROUND_POINTS = 3
+CELLS = 64  # hash grid of CELLS x CELLS cells of RADII_M[0]; distant places share a cell
 
 
 @dataclass(frozen=True)
 class Clusters:
-    """K clusters, K may be 0: points (P, 4) float32 [x y z intensity], those of cluster i from
-    first[i] to first[i + 1], first (K + 1,) int64; metres, from a level sensor at SENSOR_HEIGHT.
-    ids (K,) int64: the numbers that they had. ground (K,) float64: z of the ground under each; None
-    for a flat one under the sensor."""
+    """K clusters in a NormalizedView; K may be 0.
+
+    Attributes:
+        points: (P, 4) float32 [x y z intensity], metres.
+        first: (K + 1,) int64; cluster i has the points first[i] to first[i + 1].
+        ids: (K,) int64 ids in the cloud.
+        ground: (K,) float64, z of the ground below each cluster; None: flat ground at
+            -SENSOR_HEIGHT.
+    """
 
     points: np.ndarray
     first: np.ndarray
@@ -39,43 +44,47 @@ class Clusters:
 
     @property
     def sizes(self) -> np.ndarray:
-        """(K,) points of each."""
+        """Number of points of each cluster, (K,)."""
         return np.diff(self.first)
 
     def take(self, chosen: np.ndarray) -> Clusters:
-        """The clusters at indices (M,)."""
+        """Return the clusters at indices (M,)."""
         sizes = self.sizes[chosen]
         first = np.concatenate([[0], np.cumsum(sizes)])
         rows = np.repeat(self.first[chosen] - first[:-1], sizes) + np.arange(first[-1])
         return Clusters(self.points[rows], first, self.ids[chosen],
                         None if self.ground is None else self.ground[chosen])
 
-    def nearest(self, most: int) -> Clusters:
-        """At most so many, those whose means are nearest to the sensor, in their order."""
-        if len(self) <= most:
+    def take_nearest(self, count: int) -> Clusters:
+        """Return at most `count` clusters, those with means nearest to the sensor, in order."""
+        if len(self) <= count:
             return self
-        away = np.hypot(*middles(self.points, self.first).T)
-        return self.take(np.sort(np.argsort(away, kind="stable")[:most]))
+        distances = np.hypot(*compute_centroids(self.points, self.first).T)
+        return self.take(np.sort(np.argsort(distances, kind="stable")[:count]))
 
-    def on(self, ground: np.ndarray) -> Clusters:
-        """The same clusters, none of them empty, over the ground's points (G, 3)."""
-        return replace(self, ground=ground_under(ground, middles(self.points, self.first)))
+    def with_ground(self, ground: np.ndarray) -> Clusters:
+        """Return these clusters, none of them empty, with ground heights from points (G, 3)."""
+        return replace(self, ground=find_ground_heights(
+            ground, compute_centroids(self.points, self.first)))
 
     @property
     def floor(self) -> np.ndarray:
-        """(K,) z of the ground under each."""
+        """z of the ground below each cluster, (K,)."""
         return np.full(len(self), -SENSOR_HEIGHT) if self.ground is None else self.ground
 
 
 @dataclass(frozen=True)
 class ClusterInput:
-    """What the network reads of K clusters, N = config.points each.
+    """Network input for K clusters with N = config.points points each.
 
-    points (K, N, 5) float32: x y z from the mean, turned, metres; intensity; height over the
-    ground there, metres. valid (K, N) bool: False for repeated ones. context (K, 6)
-    float32: range, height of the mean, of the lowest and of the highest point, numbers of points,
-    and log of the range, all about 0 .. 2. centres (K, 3) float64: the means; azimuths (K,) float64
-    of them.
+    Attributes:
+        points: (K, N, 5) float32: x y z relative to the mean, rotated, metres; intensity; height
+            above the ground, metres.
+        valid: (K, N) bool, False for repeated points.
+        context: (K, 6) float32: range, heights of the mean, of the lowest and of the highest
+            point, log of the number of points, and log of the range, scaled to about 0..2.
+        centres: (K, 3) float64 means.
+        azimuths: (K,) float64 azimuths of the means, radians.
     """
 
     points: np.ndarray
@@ -85,23 +94,31 @@ class ClusterInput:
     azimuths: np.ndarray
 
 
-def clusters_of(frame: PointCloud, cluster_ids: np.ndarray, min_points: int = 1,
+def make_clusters(frame: PointCloud, cluster_ids: np.ndarray, min_points: int = 1,
                 ground: np.ndarray | None = None) -> Clusters:
-    """The clusters of a frame of N points, with numbers (N,) int, 0 and below for none, that have
-    enough points, by their numbers. Without an intensity it is 0. ground (N,) bool: the points
-    that say how high the ground is under each; None for a flat one."""
+    """Return the clusters of a frame of N points, in the order of their ids.
+
+    Args:
+        cluster_ids: (N,) int, 0 and below for no cluster.
+        min_points: smaller clusters are dropped.
+        ground: (N,) bool, ground points that give the height of the ground; None: flat ground.
+    """
     groups = group_by_id(np.asarray(cluster_ids), min_points)
     points = np.zeros((len(groups.rows), 4), np.float32)
     points[:, :3] = frame.xyz[groups.rows]
     if frame.intensity is not None:
         points[:, 3] = frame.intensity[groups.rows]
-    found = Clusters(points, groups.start, groups.numbers)
-    return found if ground is None else found.on(frame.xyz.compress(ground, axis=0))
+    clusters = Clusters(points, groups.start, groups.numbers)
+    if ground is None:
+        return clusters
+    return clusters.with_ground(frame.xyz.compress(ground, axis=0))
 
 
-def points_of(boxes: np.ndarray, frame: PointCloud, margin: float) -> Clusters:
-    """Return one cluster for each of boxes (K, 7), in their order: the points of a frame within the
-    box, grown by margin metres. A point can be in several; a cluster can be without points."""
+def crop_boxes(boxes: np.ndarray, frame: PointCloud, margin: float) -> Clusters:
+    """Return the points in each of the boxes (K, 7), enlarged by `margin` metres, as clusters.
+
+    A point can be in several clusters, and clusters can be empty.
+    """
     indices, first = points_in_boxes(frame.xyz, boxes, margin)
     points = np.zeros((len(indices), 4), np.float32)
     points[:, :3] = frame.xyz[indices]
@@ -110,14 +127,19 @@ def points_of(boxes: np.ndarray, frame: PointCloud, margin: float) -> Clusters:
     return Clusters(points, first, np.arange(1, len(boxes) + 1))
 
 
-def ground_under(xyz: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """(K,) float64: the mean z of the ground's points (G, 3) around each position xy (K, 2), within
-    the first of NEAR that has FEWEST of them; -SENSOR_HEIGHT where none has. Metres."""
-    return _ground_under(xyz, np.ascontiguousarray(xy, np.float64))
+def find_ground_heights(xyz: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Return the mean z of the ground points around each position, (K,) float64.
+
+    Args:
+        xyz: (G, 3) ground points, metres.
+        xy: (K, 2) positions. The smallest of RADII_M with MIN_GROUND_POINTS points is used; without
+            one the height is -SENSOR_HEIGHT.
+    """
+    return _find_ground_heights(xyz, np.ascontiguousarray(xy, np.float64))
 
 
 @njit(cache=True, nogil=True)
-def _ground_under(xyz, xy):
+def _find_ground_heights(xyz, xy):
     cell = np.empty(len(xyz), np.int64)
     for i in range(len(xyz)):
         cell[i] = _cell(xyz[i, 0], 0) * CELLS + _cell(xyz[i, 1], 0)
@@ -125,8 +147,8 @@ def _ground_under(xyz, xy):
     heights = np.full(len(xy), -SENSOR_HEIGHT)
     for k in range(len(xy)):
         x, y = xy[k]
-        for reach in NEAR:
-            cells = int(np.ceil(reach / NEAR[0]))
+        for reach in RADII_M:
+            cells = int(np.ceil(reach / RADII_M[0]))
             count, total = 0, 0.0
             for row in range(-cells, cells + 1):
                 for column in range(-cells, cells + 1):
@@ -135,7 +157,7 @@ def _ground_under(xyz, xy):
                         if (xyz[j, 0] - x) ** 2 + (xyz[j, 1] - y) ** 2 <= reach * reach:
                             count += 1
                             total += xyz[j, 2]
-            if count >= FEWEST:
+            if count >= MIN_GROUND_POINTS:
                 heights[k] = total / count
                 break
     return heights
@@ -143,21 +165,23 @@ def _ground_under(xyz, xy):
 
 @njit(cache=True, nogil=True)
 def _cell(along, off):
-    return int((np.floor(along / NEAR[0]) + off) % CELLS)
+    return int((np.floor(along / RADII_M[0]) + off) % CELLS)
 
 
-def middles(points: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """(K, 2) means of x and y of clusters, none of them empty."""
+def compute_centroids(points: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Return the means of x and y, (K, 2), of clusters, none of them empty."""
     if len(first) == 1:
         return np.zeros((0, 2))
     sums = np.add.reduceat(points[:, :2].astype(np.float64), first[:-1], axis=0)
     return sums / np.diff(first)[:, None]
 
 
-def network_input(clusters: Clusters, count: int, seed: int = 0) -> ClusterInput:
-    """At most `count` points of each cluster, drawn at random by the seed (Eq. 13): the same for
-    the same points in the same order, whatever clusters are beside them."""
-    points, valid, low_high, centres = _sampled(clusters.points, clusters.first, count, seed)
+def make_network_input(clusters: Clusters, count: int, seed: int = 0) -> ClusterInput:
+    """Make the network input from at most `count` random points of each cluster (Eq. 13).
+
+    The sample of a cluster depends on `seed` and on its own points, not on the other clusters.
+    """
+    points, valid, low_high, centres = _sample_points(clusters.points, clusters.first, count, seed)
     azimuths = np.arctan2(centres[:, 1], centres[:, 0])
     reach = np.maximum(np.hypot(centres[:, 0], centres[:, 1]), 1e-3)
     inputs = np.empty((*points.shape[:2], 5), np.float32)
@@ -174,7 +198,7 @@ def network_input(clusters: Clusters, count: int, seed: int = 0) -> ClusterInput
 
 
 @njit(cache=True, nogil=True)
-def _sampled(points, first, count, seed):
+def _sample_points(points, first, count, seed):
     clusters = len(first) - 1
     out = np.zeros((clusters, count, 4), np.float32)
     valid = np.zeros((clusters, count), np.bool_)
@@ -194,7 +218,7 @@ def _sampled(points, first, count, seed):
         indices = np.arange(size)
         state = np.uint64(seed * 0x9E3779B97F4A7C15 + 0x632BE59BD9B4E019)
         kept = min(size, count)
-        for i in range(kept):  # the beginning of a shuffle (Fisher and Yates)
+        for i in range(kept):  # the first steps of a Fisher-Yates shuffle
             state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
             j = i + int((state >> np.uint64(33)) % np.uint64(size - i))
             indices[i], indices[j] = indices[j], indices[i]

@@ -1,8 +1,8 @@
-"""The cluster network in compiled kernels, for inference on a CPU.
+"""PointNet with compiled kernels, for inference on a CPU.
 
-Torch's network fills every cluster up to the same number of points and every group up to the same
-number of neighbours, as repeated ones change no maximum. Here only those that are there are
-computed. The result is that of torch within rounding.
+The torch network pads every cluster and every group to the same size with repeated points, which
+do not change a maximum. This implementation skips the padding. The result equals that of torch up
+to rounding.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from lidar_perception.detectors.matrix_kernel import (
     BLOCK,
     LANES,
     multiply,
-    packed,
-    padded,
-    padded_bias,
+    pack_weights,
+    pad_bias,
+    pad_channels,
 )
 from lidar_perception.detectors.parallel import run_in_parts
 from lidar_perception.detectors.pointnet import kernels
@@ -29,14 +29,13 @@ from lidar_perception.detectors.pointnet.clusters import CONTEXT, POINT, Cluster
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 
 NORM_EPS = 1e-5  # of batch norms
-CHUNK = 32  # clusters whose rows stay in the cache
+CHUNK = 32  # clusters per batch, so that their rows stay in the cache
 
 ZERO, NO_FLOOR = np.float32(0), np.float32(-np.inf)
 
 
 class Layer(NamedTuple):
-    """A linear layer of C values: weights and bias as in matrix_kernel.multiply, and whether ReLU
-    follows."""
+    """A linear layer with `channels` outputs; weights and bias as in matrix_kernel.multiply."""
 
     weights: np.ndarray
     bias: np.ndarray
@@ -44,18 +43,18 @@ class Layer(NamedTuple):
     relu: bool
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
-        """Return (R, C and more), zero beyond C, of rows (R, B)."""
+        """Apply the layer to rows (R, B); outputs beyond `channels` are 0."""
         return multiply(rows, self.weights, self.bias, ZERO if self.relu else NO_FLOOR)
 
 
 class CompiledPointNet:
-    """A network on the CPU. Several threads may call it at once. Only where LANES is not 0.
+    """A network on the CPU, which can be called from several threads. It requires LANES above 0.
 
     Args:
-        tensors: name -> array, the state_dict of network.make_pointnet(config).
+        tensors: state_dict of network.make_pointnet(config), by name.
 
     Raises:
-        Misfit: the tensors are those of another network.
+        Misfit: the tensors belong to another network.
     """
 
     def __init__(self, config: PointNetConfig, tensors: Mapping[str, np.ndarray]):
@@ -91,7 +90,7 @@ class CompiledPointNet:
         """Stay on the CPU."""
 
     def __call__(self, inputs: ClusterInput) -> Outputs[np.ndarray]:
-        """Compute what the network returns for K clusters; K may be 0."""
+        """Return the outputs of the network for K clusters; K may be 0."""
         values = np.empty((len(inputs.context), self.outputs.channels), np.float32)
 
         def compute(begin: int, end: int) -> None:
@@ -104,10 +103,10 @@ class CompiledPointNet:
         return Outputs(*np.split(values, [*accumulate(self.widths[:-1])], axis=1))
 
     def _values(self, points: np.ndarray, valid: np.ndarray, context: np.ndarray) -> np.ndarray:
-        """Return (K, C) for a few clusters, the arguments as in ClusterInput."""
+        """Return all outputs (K, C) for a few clusters; arguments as in ClusterInput."""
         sizes = valid.sum(axis=1)
         first = np.concatenate([[0], np.cumsum(sizes)])
-        rows = np.zeros((first[-1], padded(POINT)), np.float32)
+        rows = np.zeros((first[-1], pad_channels(POINT)), np.float32)
         rows[:, :POINT] = points[valid]
         dense = (sizes / np.float32(self.config.points))[:, None].astype(np.float32)
         features = _through(self.points, rows)
@@ -131,7 +130,7 @@ class CompiledPointNet:
 
 
 class _Local:
-    """LocalNet; its groups hold only the points that are there."""
+    """LocalNet without padding: groups contain only existing points."""
 
     def __init__(self, config: PointNetConfig, weights: LayerWeights):
         self.shallow = config.point_channels[-1]  # width of the features of a point
@@ -144,7 +143,8 @@ class _Local:
 
     def __call__(self, rows: np.ndarray, first: np.ndarray, features: np.ndarray,
                  most: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return (R, C) for the centres of all clusters, and the first of each (K + 1,)."""
+        """Return features (R, C) of the centres of all clusters, and the first centre of each
+        cluster (K + 1,)."""
         relative, starts, density, first_centre = kernels.grouped(rows, first, most, self.radii,
                                                                   self.counts)
         weights = density / density.sum(axis=1, keepdims=True) * np.float32(len(self.counts))
@@ -160,7 +160,7 @@ class _Local:
 
 
 class _Coarse:
-    """CoarseNet; the maximum over all groups of a cluster."""
+    """CoarseNet with the maximum over all groups of a cluster."""
 
     def __init__(self, config: PointNetConfig, weights: LayerWeights):
         self.radius, self.count = np.float32(config.coarse_radius), config.coarse_neighbours
@@ -172,7 +172,7 @@ class _Coarse:
 
     def __call__(self, rows: np.ndarray, first: np.ndarray, local: np.ndarray,
                  first_centre: np.ndarray, most: int) -> np.ndarray:
-        """Return (K, C) from the features local (R, B) of the centres of each cluster."""
+        """Return (K, C) from the features `local` (R, B) of the centres."""
         greatest = kernels.coarse_maxima(rows, first, self.features(local), first_centre, most,
                                          self.count, self.radius, self.position)
         return greatest[:, :self.features.channels]
@@ -190,8 +190,8 @@ def _normed(weights: LayerWeights, name: str, channels: int, out: int) -> Weight
 
 
 def _layer(weight: np.ndarray, bias: np.ndarray | None, relu: bool) -> Layer:
-    values = packed(weight[:, :, None])
-    return Layer(values, padded_bias(bias, len(values) * BLOCK), len(weight), relu)
+    values = pack_weights(weight[:, :, None])
+    return Layer(values, pad_bias(bias, len(values) * BLOCK), len(weight), relu)
 
 
 def _through(layers: Sequence[Layer], rows: np.ndarray) -> np.ndarray:
@@ -201,8 +201,8 @@ def _through(layers: Sequence[Layer], rows: np.ndarray) -> np.ndarray:
 
 
 def _side_by_side(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Return parts (R, C_i) as (R, C) float32, filled up with zeros as layers read them."""
+    """Concatenate parts (R, C_i) as (R, C) float32, padded with zeros for the next layer."""
     width = sum(part.shape[1] for part in parts)
-    joined = np.zeros((len(parts[0]), padded(width)), np.float32)
+    joined = np.zeros((len(parts[0]), pad_channels(width)), np.float32)
     np.concatenate(parts, axis=1, out=joined[:, :width])
     return joined

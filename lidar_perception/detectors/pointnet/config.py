@@ -1,8 +1,9 @@
-"""What a cluster network looks like: paper C's improved PointNet, its ablations and baselines.
+"""Configuration of paper C's improved PointNet, its ablations and baselines.
 
-Paper C (Zhang et al., PLOS One 2026, e0348581) gives the parts (Eq. 13 to 19) but no widths. The
-switches are those of its Table 5; PointNet and PointNet++ (SSG) are settings of the same network.
-A checkpoint holds the dataclass as JSON, so that weights always come with their network.
+Paper C (Zhang et al., PLOS One 2026, e0348581) defines the parts (Eq. 13 to 19) but gives no layer
+widths. The switches are those of its Table 5; PointNet and PointNet++ (SSG) are settings of the
+same network. A checkpoint contains the dataclass as JSON, so weights and architecture cannot get
+separated.
 """
 
 from __future__ import annotations
@@ -15,25 +16,32 @@ from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams, E
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.types import CLASSES, InputError
 
-MAX_POINTS = 4096  # of a cluster: what is computed grows with it
+MAX_POINTS = 4096  # of a cluster, to bound computing time
 
 
-# l w h in metres, means of KITTI's training labels (Geiger et al. 2012)
 @dataclass(frozen=True)
 class PointNetConfig:
-    """A network that looks at one cluster.
+    """Architecture of a network that classifies one cluster at a time.
 
-    name: what it is called. classes: those of its scores, background comes last.
-    dynamic_threshold, log_point_count: how clusters are made (Eq. 6, 7, 11), see clustering.
-    msg: points are grouped at all radii, else, where they are grouped, at the largest only.
-    mrg: features of coarser and of no grouping stand beside the fine ones, weighted by density
-    (Eq. 15, 17). skip: shallow features stand beside the deep ones (Eq. 16). grouped: without it,
-    msg and mrg, each point is by itself, as in PointNet.
-
-    points: most points of a cluster that are read (Eq. 13). centroids, coarse: points around which
-    points, and then centroids, are grouped. radii, coarse_radius in metres; neighbours,
-    coarse_neighbours: most points of a group. point_channels to head_channels: widths. yaw_bins:
-    parts of the circle. sizes: l w h of each class, metres, that sizes are relative to.
+    Attributes:
+        name: name of the variant.
+        classes: classes of its scores, without the background, which comes last.
+        dynamic_threshold, log_point_count: clustering (Eq. 6, 7, 11), see `clustering`.
+        msg: group points at all radii; otherwise, if points are grouped, at the largest radius.
+        mrg: concatenate features of a coarser grouping and of single points, weighted by density
+            (Eq. 15, 17).
+        skip: concatenate shallow features with the deep ones (Eq. 16).
+        grouped: group points; without it, msg and mrg, points are processed one by one, as in
+            PointNet.
+        points: maximum number of points read from a cluster (Eq. 13).
+        centroids, coarse: numbers of groups of points, and of groups of these centroids.
+        radii, coarse_radius: of the groups, metres.
+        neighbours, coarse_neighbours: maximum number of members of a group.
+        point_channels, group_channels, local_channels, global_channels, head_channels: widths of
+            the layers.
+        yaw_bins: number of bins of the circle.
+        sizes: reference length, width and height of each class, metres; by default the means of
+            KITTI's training labels (Geiger et al. 2012).
     """
 
     network: ClassVar[str] = "pointnet"
@@ -73,11 +81,11 @@ class PointNetConfig:
         if not self.classes or len(self.sizes) != len(self.classes):
             raise ValueError("classes and sizes differ in length")
         if len(set(self.classes)) < len(self.classes) or min(map(min, self.sizes)) <= 0:
-            raise ValueError("a class is there twice, or has a size of 0")
+            raise ValueError("a class occurs twice, or has a size of 0")
         if not self.radii or len(self.radii) != len(self.neighbours):
             raise ValueError("radii and neighbours differ in length")
         if list(self.radii) != sorted(self.radii) or max(self.neighbours) > self.points:
-            raise ValueError("radii must rise, and neighbours be at most as many as points")
+            raise ValueError("radii must be ascending, and neighbours at most points")
         if not max(self.coarse, self.coarse_neighbours) <= self.centroids <= self.points:
             raise ValueError("coarse and coarse_neighbours must be at most centroids, and these at "
                              "most points")
@@ -86,12 +94,12 @@ class PointNetConfig:
 
     @property
     def title(self) -> str:
-        """Which PointNet, for people: nothing for the one of the paper."""
+        """Name of the variant in parentheses; empty for the network of the paper."""
         return "" if self.name == "improved" else f"({self.name})"
 
     @property
     def groups(self) -> tuple[tuple[float, int], ...]:
-        """(radius, most neighbours) of each scale in use; none for PointNet."""
+        """Radius and maximum number of neighbours of each scale; empty for PointNet."""
         scales = tuple(zip(self.radii, self.neighbours))
         if self.msg:
             return scales
@@ -99,13 +107,16 @@ class PointNetConfig:
 
     @property
     def least_points(self) -> int:
-        """Points that a cluster is filled up to, so that there are enough of them to group."""
+        """Minimum number of points after padding, so that all groups can be filled."""
         return max(self.coarse, self.coarse_neighbours, *self.neighbours)
 
     @property
     def clustering(self) -> ClusteringParams:
-        """How clusters are made for this network. Without dynamic_threshold one distance serves
-        all points, without log_point_count a point alone makes others follow."""
+        """Clustering parameters for this network.
+
+        Without dynamic_threshold the distance threshold is the same for all points. Without
+        log_point_count it does not depend on the number of neighbours.
+        """
         euclidean = EuclideanParams(
             threshold="local" if self.dynamic_threshold else "fixed", gamma=0.0,
             beta=EuclideanParams().beta if self.log_point_count else 0.0)
@@ -117,7 +128,7 @@ class PointNetConfig:
 
 
 class Switches(TypedDict, total=False):
-    """Those fields of PointNetConfig that differ between the networks of paper C."""
+    """Fields of PointNetConfig that differ between the networks of paper C."""
 
     dynamic_threshold: bool
     log_point_count: bool
@@ -128,7 +139,7 @@ class Switches(TypedDict, total=False):
 
 
 PLAIN = Switches(msg=False, mrg=False, skip=False, grouped=False)
-# Paper C, Table 5; where it does not say how clusters are made, as it proposes.
+# Paper C, Table 5. If the table does not specify the clustering, the proposed one is used.
 ABLATIONS: dict[str, Switches] = {
     "base": {"dynamic_threshold": False, "log_point_count": False, **PLAIN},
     "dynamic-threshold": {"log_point_count": False, **PLAIN},
@@ -146,9 +157,12 @@ NETWORKS: dict[str, Switches] = {
 }
 
 
-def pointnet_config(name: str = "improved", **changes: Any) -> PointNetConfig:
-    """The config of a network of NETWORKS, with other fields changed. InputError for a name that is
-    none."""
+def make_pointnet_config(name: str = "improved", **changes: Any) -> PointNetConfig:
+    """Make the config of a network of NETWORKS, with other fields changed.
+
+    Raises:
+        InputError: the name is unknown, or the fields do not fit together.
+    """
     if name not in NETWORKS:
         raise InputError(f"there is no network {name!r}; choose one of {', '.join(NETWORKS)}")
     try:

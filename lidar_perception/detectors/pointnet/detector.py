@@ -26,19 +26,21 @@ from lidar_perception.detectors.normalized_view import (
     segment_view_ground,
 )
 from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
-from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
+from lidar_perception.detectors.pointnet.clusters import Clusters, make_clusters
 from lidar_perception.detectors.pointnet.compiled import CompiledPointNet
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams, PointNetParams
-from lidar_perception.detectors.pointnet.predict import Network, Predictions, found
+from lidar_perception.detectors.pointnet.predict import Network, Predictions, select_detections
 from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.runs.threads import set_thread_count
 from lidar_perception.types import PointCloud
 
 
 class PointNetDetector(NetworkDetector):
-    """The improved PointNet as a detector, see contract.py. It covers the whole cloud. Ground and
-    clusters are computed where they are None."""
+    """The improved PointNet as a detector, see contract.py. It covers the whole cloud.
+
+    Ground and clusters are computed if they are None.
+    """
 
     group = "pointnet"
     params: PointNetDetectorParams
@@ -75,16 +77,16 @@ class PointNetDetector(NetworkDetector):
             cluster_ids = cluster_obstacles(view.frame, ground, self.params.clustering,
                                             view.source.xyz)
         t3 = perf_counter()
-        clusters = clusters_of(view.frame, cluster_ids, settings.min_points)
+        clusters = make_clusters(view.frame, cluster_ids, settings.min_points)
         dropped = max(len(clusters) - settings.max_clusters, 0)
-        clusters = clusters.nearest(settings.max_clusters).on(
+        clusters = clusters.take_nearest(settings.max_clusters).with_ground(
             view.frame.xyz.compress(ground, axis=0))
         t4 = self.classifier.now()
         predictions = self.classifier.predict(clusters, cpu_fallback=settings.cpu_fallback)
         t5 = self.classifier.now()
-        detections, best, broken = self._detections(predictions)
+        detections, best, broken = self._make_detections(predictions)
         boxes = move_cars_to_points(detections.boxes, detections.class_ids,
-                               view.frame.xyz.compress(~ground, axis=0), settings.on_points)
+                                    view.frame.xyz.compress(~ground, axis=0), settings.on_points)
         detections = restore_detections(replace(detections, boxes=boxes.astype(np.float32)),
                                         view.pose)
         t6 = perf_counter()
@@ -93,21 +95,20 @@ class PointNetDetector(NetworkDetector):
         problem = broken or self._find_problem(view, cluster_ids, clusters, dropped)
         return DetectionResult(detections, timings, problem or self.fallback, best)
 
-    def _detections(self, predicted: Predictions) -> tuple:
-        """Return the detections, and what best_scores gives."""
+    def _make_detections(self, predicted: Predictions) -> tuple:
+        """Return the detections, and the result of best_scores."""
         broken = None
         best: dict[str, float] = {}
-        sound = np.isfinite(np.column_stack([predicted.probabilities, predicted.boxes])).all(axis=1)
-        if not sound.all():
-            broken = ("the network's outputs are not numbers (NaN) for "
-                      f"{len(sound) - sound.sum()} of {len(sound)} clusters; the weights or the "
-                      "intensity are broken")
-        predicted = predicted.take(np.flatnonzero(sound))
+        valid = np.isfinite(np.column_stack([predicted.probabilities, predicted.boxes])).all(axis=1)
+        if not valid.all():
+            broken = (f"the network's outputs are NaN for {len(valid) - valid.sum()} of "
+                      f"{len(valid)} clusters; check the weights and the intensity")
+        predicted = predicted.take(np.flatnonzero(valid))
         detections = calibrate_scores(
-            found(predicted, self.classifier.config,
-                  self.classifier.raw_scores(self.min_scores), self.settings.nms),
+            select_detections(predicted, self.classifier.config,
+                              self.classifier.raw_scores(self.min_scores), self.settings.nms),
             self.classifier.header.calibration)
-        if len(detections) == 0 and sound.any():
+        if len(detections) == 0 and valid.any():
             highest = predicted.probabilities[:, :len(self.classes)].max(axis=0)
             best, nan = self.classifier.best_scores(highest.tolist())
             broken = nan or broken
@@ -118,14 +119,14 @@ class PointNetDetector(NetworkDetector):
         if len(view.source) == 0:
             return "the cloud is empty or has no finite point, or crop.* leaves none"
         if not (cluster_ids > 0).any():
-            return ("no clusters; are ground.sensor_pose, and the numbers of clustering.euclidean "
-                    "or clustering.dbscan, right for this sensor?")
+            return ("no clusters; check ground.sensor_pose, and clustering.euclidean or "
+                    "clustering.dbscan for this sensor")
         if len(clusters) == 0:
             return (f"every cluster has fewer than {self.settings.min_points} points; lower "
                     "pointnet.min_points")
         if dropped:
-            return (f"{dropped} of {len(clusters) + dropped} clusters are left out, the "
-                    "farthest; raise clustering's min_size or pointnet.max_clusters")
+            return (f"the farthest {dropped} of {len(clusters) + dropped} clusters are ignored; "
+                    "raise clustering's min_size or pointnet.max_clusters")
         return view.intensity_problem()
 
     def warm_up(self) -> None:
@@ -141,12 +142,11 @@ def load_pointnet_detector(path: str | Path = "", device: str = "auto",
     """Load a detector from a checkpoint.
 
     Args:
-        path: file of the weights; empty: the one that `params` name, or else the one of the
-            package.
-        params: None: ground and clusters are found as the network was trained with.
+        path: file of the weights; empty: `params.pointnet.weights`, by default the shipped one.
+        params: None: defaults, with the ground and clustering parameters of the training.
 
     Raises:
-        InputError: the file is missing or not of a PointNet, or the device does not exist.
+        InputError: the file is missing or not a PointNet, or the device does not exist.
     """
     settings = PointNetParams() if params is None else params.pointnet
     path = Path(path) if str(path) not in ("", ".") else weights_file(settings)
@@ -166,12 +166,12 @@ def load_pointnet_detector(path: str | Path = "", device: str = "auto",
 
 
 def _load_network(path: Path, device: str, engine: str) -> tuple[Header, Network]:
-    """Load the network of a checkpoint; with torch only where no compiled kernels can run it."""
+    """Load the network of a checkpoint; with torch only if no compiled kernels can run it."""
     if device == CPU and engine == "auto" and LANES:
-        with suppress(Misfit):  # torch finds out what does not fit
+        with suppress(Misfit):  # the torch path reports what does not fit
             header, tensors = read_arrays(path, PointNetConfig)
             return header, CompiledPointNet(header.config, tensors)
-    from lidar_perception.detectors.pointnet.network import fused, load_pointnet
+    from lidar_perception.detectors.pointnet.network import fuse_norms, load_pointnet
     from lidar_perception.detectors.pointnet.torch_network import TorchPointNet
     header, network = load_pointnet(path)
-    return header, TorchPointNet(fused(network), engine)
+    return header, TorchPointNet(fuse_norms(network), engine)

@@ -1,7 +1,7 @@
-"""Compiled kernels of the cluster network: groups of points, and maxima.
+"""Compiled kernels of PointNet: grouping of points, and maxima.
 
-Rows of several clusters or groups follow each other: those of number k are first[k] to first[k + 1]
-of first (K + 1,) int64.
+Rows of several clusters or groups are concatenated; number k has the rows first[k] to first[k + 1],
+with first (K + 1,) int64.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from lidar_perception.detectors.matrix_kernel import UNROLL
 
 @njit(cache=True, nogil=True)
 def maxima(rows, first, columns):
-    """Return (K, columns) float32, the greatest of the first columns of each group of rows; NaN
-    where a value is NaN or a group is empty."""
+    """Return the maximum of each group of rows over the first `columns` columns, (K, columns)
+    float32; NaN if a value is NaN or the group is empty."""
     greatest = np.full((len(first) - 1, columns), np.nan, np.float32)
     for k in range(len(greatest)):
         if first[k] < first[k + 1]:
@@ -29,8 +29,8 @@ def maxima(rows, first, columns):
 
 @njit(cache=True, nogil=True)
 def _nearest(points, begin, end, centre, count, distances, indices):
-    """Fill distances and indices with the nearest of points begin .. end to point number centre,
-    squared and rising; return how many there are, at most count."""
+    """Write the squared distances, ascending, and the indices of the points among begin .. end that
+    are nearest to point number `centre`; return their number, at most `count`."""
     found = 0
     for i in range(begin, end):
         x = points[centre, 0] - points[i, 0]
@@ -53,13 +53,13 @@ def grouped(points, first, most, radii, counts):
     """Group points (P, 5 or more) around the first `most` points of each cluster.
 
     Args:
-        radii, counts: (S,) float32 and int64 of each scale, radii rising: only points up to a
-            radius, and at most so many of these, the nearest, are in a group.
+        radii, counts: (S,) float32 and int64, ascending radius and maximum size of the groups of
+            each scale. A group contains the nearest points.
 
     Returns:
-        For each scale, relative points (S, R, 8) float32, x y z in radii and two more numbers,
-        filled up with zeros; first rows of the groups (S, C + 1); the share of counts that was
-        found over the radius (C, S) float32; and the first centre of each cluster (K + 1,).
+        For each scale, relative points (S, R, 8) float32, x y z in units of the radius and two more
+        numbers, padded with zeros; first rows of the groups (S, C + 1); density (C, S) float32, the
+        size of a group relative to counts x radius; and the first centre of each cluster (K + 1,).
     """
     clusters, scales = len(first) - 1, len(radii)
     first_centre = np.zeros(clusters + 1, np.int64)
@@ -91,12 +91,16 @@ def grouped(points, first, most, radii, counts):
 
 @njit(cache=True, nogil=True)
 def coarse_maxima(points, first, rows, first_row, most, count, radius, weights):
-    """Return (K, C) float32: the greatest of the sums of a layer over coarse groups of a cluster.
+    """Return the maximum of a linear layer with ReLU over the coarse groups of each cluster, (K, C)
+    float32.
 
-    The groups lie around the first `most` centres of a cluster: of its centres, which are its first
-    points, up to count that are nearest and within the radius. rows (R, C): the layer's sums from
-    the features of each centre, first_row (K + 1,); weights (3, C): of its relative position.
-    Negative sums count as 0.
+    The centres of a cluster are its first points. A group consists of up to `count` centres within
+    `radius` of one of the first `most` centres.
+
+    Args:
+        rows, first_row: (R, C) float32, output of the layer for the features of the centres, and
+            (K + 1,) first row of each cluster.
+        weights: (3, C) float32, weights of the relative position.
     """
     greatest = np.zeros((len(first) - 1, rows.shape[1]), np.float32)
     distances, indices = np.empty(count, np.float32), np.empty(count, np.int64)

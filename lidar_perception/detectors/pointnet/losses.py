@@ -1,4 +1,4 @@
-"""Loss of the cluster network (paper C, Eq. 18)."""
+"""Training loss of PointNet (paper C, Eq. 18)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch.nn import functional
 from lidar_perception.detectors.pointnet.box_head import BoxTargets, Outputs
 
 BOX_WEIGHT, YAW_BIN_WEIGHT = 1.0, 0.3  # lambda of Eq. 18, of boxes and of yaw bins
-SMOOTH = 0.2       # m, and like numbers: from here on the box loss is linear
+SMOOTH = 0.2       # the box loss is linear above this error
 
 
 class Losses(NamedTuple):
@@ -25,9 +25,17 @@ class Losses(NamedTuple):
 
 def cluster_loss(outputs: Outputs[Tensor], labels: Tensor, targets: BoxTargets[Tensor],
                  has_box: Tensor, weights: Tensor | None = None) -> Losses:
-    """Cross entropy of labels (B,), K for background and -1 for unknown labels,
-    with a weight (K + 1,) for each class; smooth L1 of the boxes of those that have one (B,) bool,
-    and cross entropy of their yaw bins. targets: of B rows."""
+    """Compute the training loss of B clusters.
+
+    It is the sum of the cross entropy of the labels, the smooth L1 loss of boxes, and the cross
+    entropy of yaw bins.
+
+    Args:
+        labels: (B,) class, K for background, -1 for unknown (ignored).
+        targets: B encoded boxes.
+        has_box: (B,) bool, the clusters whose box counts.
+        weights: (K + 1,) weight of each class; None: 1.
+    """
     classes = functional.cross_entropy(outputs.logits.float(), labels, weight=weights,
                                        ignore_index=-1)
     if not has_box.any():

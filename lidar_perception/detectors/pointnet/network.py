@@ -1,4 +1,4 @@
-"""The improved PointNet of paper C (Eq. 13 to 17), its ablations and its baselines.
+"""The network of paper C, the improved PointNet (Eq. 13 to 17), its ablations and baselines.
 
     points -> PointMlp --------------------------+-> raw ----------------+
                  +-> LocalNet (MSG, Eq. 14) -> max -> fine --------------+-> head -> class, box
@@ -6,9 +6,9 @@
                  shallow features, skipped over (Eq. 16) ----------------+
 
 B clusters, N points, M centroids, k neighbours, C channels. A cluster with fewer than N points is
-filled up with its own, which change no maximum; `valid` is False for them, so that they are
-nobody's neighbours. Of neighbours out of reach the nearest one, which is the centroid itself, takes
-the place.
+padded with copies of its points, which do not change a maximum. `valid` is False for copies, so
+they are not used as neighbours. Neighbours beyond the radius are replaced by the nearest one, the
+centroid itself.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from lidar_perception.detectors.pointnet.config import PointNetConfig
 
 
 class LinearNormRelu(nn.Sequential):
-    """A linear layer, batch norm over all but the last axis, ReLU."""
+    """Linear layer, batch norm over all axes but the last, and ReLU."""
 
     def __init__(self, channels: int, out: int):
         super().__init__(nn.Linear(channels, out, bias=False), nn.BatchNorm1d(out),
@@ -40,26 +40,33 @@ class LinearNormRelu(nn.Sequential):
         return super().forward(x.reshape(-1, x.shape[-1])).view(*x.shape[:-1], -1)
 
     def grouped(self, own: Tensor, features: Tensor, indices: Tensor) -> Tensor:
-        """forward of own (B, M, k, c) beside the rows of features (B, N, C) at indices (B, M, k):
-        each row goes through the layer once, however many groups it is in."""
+        """Apply the layer to own (B, M, k, c) concatenated with rows of features.
+
+        Each row of features (B, N, C), selected by indices (B, M, k), is multiplied only once even
+        if it belongs to several groups.
+        """
         linear, norm, relu = self
         assert isinstance(linear, nn.Linear)
         of_own, of_rows = linear.weight.split([own.shape[-1], features.shape[-1]], dim=1)
         x = functional.linear(own, of_own, linear.bias).add_(
-            taken(functional.linear(features, of_rows), indices))
+            gather_rows(functional.linear(features, of_rows), indices))
         return relu(norm(x.flatten(0, 2))).view(x.shape)
 
 
 def mlp(*channels: int) -> nn.Sequential:
-    """Layers from each width to the next."""
+    """Return LinearNormRelu layers from each width to the next."""
     return nn.Sequential(*(LinearNormRelu(a, b) for a, b in pairwise(channels)))
 
 
 def nearest(centres: Tensor, xyz: Tensor, valid: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """squared (B, M, k) rising, and indices (B, M, k), of the nearest of xyz (B, N, 3) to each
-    centre (B, M, 3), inf where no valid one is left; k = count."""
-    # Differences, not a matrix product: a point is at no distance from itself in any format.
-    # Axis by axis: a sum over an axis of three takes four times as long.
+    """Return the `count` nearest points of xyz (B, N, 3) to each of the centres (B, M, 3).
+
+    Returns:
+        Squared distances (B, M, k), ascending, inf if there are fewer than k valid points; and
+        indices (B, M, k).
+    """
+    # Differences instead of a matrix product keep the distance of a point to itself exactly 0.
+    # Separate axes: a sum over an axis of length 3 takes four times as long.
     x, y, z = ((a[:, :, None] - b[:, None]).square() for a, b in zip(centres.unbind(-1),
                                                                      xyz.unbind(-1)))
     squared = x + y + z                                                    # (B, M, N)
@@ -67,8 +74,8 @@ def nearest(centres: Tensor, xyz: Tensor, valid: Tensor, count: int) -> tuple[Te
     return squared.topk(count, dim=2, largest=False)
 
 
-def taken(values: Tensor, indices: Tensor) -> Tensor:
-    """(B, M, k, C): rows of values (B, N, C) at indices (B, M, k)."""
+def gather_rows(values: Tensor, indices: Tensor) -> Tensor:
+    """Return the rows (B, M, k, C) of values (B, N, C) at indices (B, M, k)."""
     first = torch.arange(len(values), device=values.device)[:, None, None] * values.shape[1]
     rows = values.flatten(0, 1).index_select(0, (indices + first).flatten())
     return rows.view(*indices.shape, -1)
@@ -77,7 +84,7 @@ def taken(values: Tensor, indices: Tensor) -> Tensor:
 class LocalNet(nn.Module):
     """Features around each centroid, grouped at each radius and weighted by density (Eq. 14, 17).
 
-    One search serves all radii, as they lie within each other.
+    One neighbour search serves all radii.
     """
 
     def __init__(self, groups: Sequence[tuple[float, int]], channels: Sequence[int],
@@ -93,7 +100,7 @@ class LocalNet(nn.Module):
         scales, density = [], []
         for (radius, k), net in zip(self.groups, self.nets):
             within = squared[..., :k] <= radius * radius                   # (B, M, k)
-            near = taken(points, torch.where(within, indices[..., :k], indices[..., :1]))
+            near = gather_rows(points, torch.where(within, indices[..., :k], indices[..., :1]))
             around = (near[..., :3] - centres[:, :, None]) / radius        # (B, M, k, 3)
             scales.append(net(torch.cat([around, near[..., 3:]], dim=-1)).amax(dim=2))
             density.append(within.sum(dim=-1) / (k * radius))
@@ -104,7 +111,7 @@ class LocalNet(nn.Module):
 
 
 class CoarseNet(nn.Module):
-    """Features of centroids grouped around fewer of them (Eq. 15)."""
+    """Features of centroids, grouped around a subset of them (Eq. 15)."""
 
     def __init__(self, channels: int, out: int, radius: float, neighbours: int):
         super().__init__()
@@ -115,14 +122,15 @@ class CoarseNet(nn.Module):
         centres = xyz[:, :count]
         squared, indices = nearest(centres, xyz, valid, self.neighbours)
         indices = torch.where(squared <= self.radius**2, indices, indices[..., :1])
-        around = (taken(xyz, indices) - centres[:, :, None]) / self.radius
+        around = (gather_rows(xyz, indices) - centres[:, :, None]) / self.radius
         layer = self.net[0]
         assert isinstance(layer, LinearNormRelu)
         return layer.grouped(around, features, indices).amax(dim=2)
 
 
 class PointNet(nn.Module):
-    """One cluster each: points (B, N, 5), valid (B, N) bool, context (B, 6) to Outputs."""
+    """Network for B clusters: points (B, N, 5), valid (B, N) bool and context (B, 6), see
+    ClusterInput, to Outputs."""
 
     temperature: Tensor
     offsets: Tensor
@@ -162,7 +170,7 @@ class PointNet(nn.Module):
         config = self.config
         features = self.points(points)                                     # (B, N, C)
         found, shallow = [], [features.amax(dim=1)]
-        # Where points lie densely grouped features say more, else those of single points (Eq. 17).
+        # Grouped features get more weight in dense clusters, single points in sparse ones (Eq. 17).
         dense = valid.sum(dim=1, keepdim=True) / config.points             # (B, 1)
         if self.local is not None and self.fine is not None:
             local = self.local(points, features, valid, config.centroids)  # (B, M, C)
@@ -185,12 +193,12 @@ class PointNet(nn.Module):
 
 
 def make_pointnet(config: PointNetConfig) -> PointNet:
-    """A network with random weights, in training mode."""
+    """Make a network with random weights, in training mode."""
     return PointNet(config)
 
 
-def fused(network: PointNet) -> PointNet:
-    """A copy for inference, with every batch norm inside the layer before it."""
+def fuse_norms(network: PointNet) -> PointNet:
+    """Return a copy for inference with every batch norm folded into the layer before it."""
     network = copy.deepcopy(network).eval()
     for module in network.modules():
         if isinstance(module, LinearNormRelu):

@@ -1,4 +1,4 @@
-"""Parameters of the detector: flags, ROS parameters and docs are made from these fields."""
+"""Parameters of the detector, the source of ROS parameters, command line options and docs."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from lidar_perception.param_fields import param
 from lidar_perception.robot.params import CropParams
 from lidar_perception.wire.params import InputParams
 
-STEPS = ("preprocess", "ground", "clustering", "network", "postprocess")  # each has its time
+STEPS = ("preprocess", "ground", "clustering", "network", "postprocess")  # keys of the timings
 
 
 @dataclass(frozen=True)
 class PointNetParams(NetworkParams):
-    """Which network, where it runs, which clusters it reads, and what counts as a detection."""
+    """Network, device, clusters and thresholds of PointNet."""
 
-    min_points: int = param(3, "Clusters of fewer points are left out.", low=1, high=1_000_000)
-    max_clusters: int = param(4000, "Clusters that are looked at, the nearest first; a scan has "
-                              "some hundred. The diagnostics say how many are left out.", low=1,
-                              high=1_000_000)
+    min_points: int = param(3, "Ignore clusters with fewer points.", low=1, high=1_000_000)
+    max_clusters: int = param(4000, "Maximum number of clusters; the nearest are kept and the "
+                              "diagnostics report the rest. A typical scan has a few hundred.",
+                              low=1, high=1_000_000)
     on_points: float = make_on_points_param()
-    engine: str = param("auto", "What runs the network on the CPU. torch: torch. auto: compiled "
-                        "kernels on x86-64 with AVX2, otherwise torch. Detections are the same.",
+    engine: str = param("auto", "Implementation of the network on the CPU. torch: torch. auto: "
+                        "compiled kernels on x86-64 with AVX2, otherwise torch. Detections are the "
+                        "same.",
                         choices=("auto", "torch"), fixed=True)
 
 
@@ -35,7 +36,7 @@ GROUND, CLUSTERING = PointNetConfig().ground, PointNetConfig().clustering
 
 @dataclass(frozen=True)
 class PointNetDetectorParams:
-    """All groups of the detector."""
+    """All parameter groups of the detector."""
 
     input: InputParams = INPUT
     crop: CropParams = CropParams()

@@ -1,4 +1,4 @@
-"""Clusters in, a class and a box for each out."""
+"""Inference: from clusters to classes and boxes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from lidar_perception.detectors.nms import apply_nms
 from lidar_perception.detectors.params import NmsParams
 from lidar_perception.detectors.pointnet.box_head import Outputs, decode
-from lidar_perception.detectors.pointnet.clusters import ClusterInput, Clusters, network_input
+from lidar_perception.detectors.pointnet.clusters import ClusterInput, Clusters, make_network_input
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.types import Detections
 
@@ -19,7 +19,8 @@ from lidar_perception.types import Detections
 class Network(Protocol):
     """A PointNet that predict() can run.
 
-    temperature (1,), offsets (K + 1,): float32, see probabilities().
+    Attributes:
+        temperature, offsets: (1,) and (K + 1,) float32, see compute_probabilities.
     """
 
     config: PointNetConfig
@@ -35,9 +36,13 @@ class Network(Protocol):
 
 @dataclass(frozen=True)
 class Predictions:
-    """Of K clusters: probabilities (K, C + 1) float32 of the C classes of the config and of
-    background, calibrated; labels (K,) int64 the likeliest class but background, or the one that
-    was asked about; boxes (K, 7) float32 if it is of that class, in the frame of the clusters."""
+    """Predictions for K clusters.
+
+    Attributes:
+        probabilities: (K, C + 1) float32, calibrated, of the C classes and the background.
+        labels: (K,) int64, the likeliest class except background, or the requested class.
+        boxes: (K, 7) float32, the box for that class, in the frame of the clusters.
+    """
 
     probabilities: np.ndarray
     labels: np.ndarray
@@ -45,22 +50,21 @@ class Predictions:
 
     @property
     def scores(self) -> np.ndarray:
-        """(K,) the probability of the class of labels."""
+        """Probability of each label, (K,)."""
         return self.probabilities[np.arange(len(self.labels)), self.labels]
 
     def take(self, chosen: np.ndarray) -> Predictions:
-        """Those of the clusters at indices (M,)."""
+        """Return the predictions for the clusters at indices (M,)."""
         return Predictions(self.probabilities[chosen], self.labels[chosen], self.boxes[chosen])
 
 
-def found(predictions: Predictions, config: PointNetConfig, least: Sequence[float],
-          nms: NmsParams = NmsParams()) -> Detections:
-    """The boxes whose score is at least `least` of their class, (C,), the best of those that
-    overlap."""
-    chosen = np.flatnonzero(predictions.scores >= np.asarray(least)[predictions.labels])
+def select_detections(predictions: Predictions, config: PointNetConfig,
+                      min_scores: Sequence[float], nms: NmsParams = NmsParams()) -> Detections:
+    """Return the boxes that reach the threshold of their class, min_scores (C,), after NMS."""
+    chosen = np.flatnonzero(predictions.scores >= np.asarray(min_scores)[predictions.labels])
     chosen = chosen[np.argsort(-predictions.scores[chosen], kind="stable")][:nms.candidates]
     return apply_nms(predictions.boxes[chosen], predictions.scores[chosen],
-                        predictions.labels[chosen], config.classes, nms)
+                     predictions.labels[chosen], config.classes, nms)
 
 
 def predict(network: Network, clusters: Clusters, seed: int = 0,
@@ -74,18 +78,19 @@ def predict(network: Network, clusters: Clusters, seed: int = 0,
     if len(clusters) == 0:
         return Predictions(np.zeros((0, classes + 1), np.float32), np.zeros(0, np.int64),
                            np.zeros((0, 7), np.float32))
-    inputs = network_input(clusters, config.points, seed)
+    inputs = make_network_input(clusters, config.points, seed)
     outputs = network(inputs)
-    calibrated = probabilities(outputs.logits, network.temperature, network.offsets)
+    calibrated = compute_probabilities(outputs.logits, network.temperature, network.offsets)
     if labels is None:
         labels = calibrated[:, :classes].argmax(axis=1)
     return Predictions(calibrated, labels, decode(outputs, inputs, config, labels))
 
 
-def probabilities(logits: np.ndarray, temperature: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Return calibrated probabilities (B, K + 1) of logits (B, K + 1): softmax(logits / temperature
-    + offsets), float32."""
-    with np.errstate(all="ignore"):  # of broken weights, which are reported
+def compute_probabilities(logits: np.ndarray, temperature: np.ndarray,
+                          offsets: np.ndarray) -> np.ndarray:
+    """Return calibrated probabilities (B, K + 1) float32 of logits (B, K + 1), which are
+    softmax(logits / temperature + offsets)."""
+    with np.errstate(all="ignore"):  # broken weights are reported elsewhere
         scaled = logits / temperature + offsets
         exponentials = np.exp(scaled - scaled.max(axis=1, keepdims=True))
         return exponentials / exponentials.sum(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Where the weights are, found without loading torch."""
+"""Paths of the weights of PointNet, without loading torch."""
 
 from __future__ import annotations
 
@@ -9,24 +9,23 @@ from lidar_perception.detectors.weights_file import require_weights
 from lidar_perception.types import InputError
 
 WEIGHTS = Path(__file__).parent / "weights" / "pointnet.safetensors"
-JUDGE = "judge.safetensors"  # beside it
+JUDGE = "judge.safetensors"  # in the same folder
 
 
 def weights_file(params: PointNetParams) -> Path:
-    """The file that params name, or else the one that comes with the package. InputError if it is
-    not there."""
+    """Return `params.weights`, by default the shipped file. InputError if it does not exist."""
     if params.weights:
         return require_weights(params.weights, "pointnet.weights")
     return _shipped(WEIGHTS)
 
 
 def find_judge_weights() -> Path:
-    """Those that were trained to judge the boxes of other detectors. InputError likewise."""
+    """Return the weights trained to classify boxes of other detectors. InputError if missing."""
     return _shipped(WEIGHTS.with_name(JUDGE))
 
 
 def _shipped(path: Path) -> Path:
     if not path.is_file():
-        raise InputError("no PointNet weights come with the package; name a checkpoint with "
-                         "pointnet.weights")
+        raise InputError("the package has no PointNet weights; set pointnet.weights to a "
+                         "checkpoint")
     return path

@@ -1,4 +1,4 @@
-"""Anchor boxes: one of each class and yaw in every cell of the head's feature map."""
+"""Anchor boxes: one per class and yaw in every cell of the head's feature map."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from lidar_perception.detectors.pointpillars.config import NetworkConfig
 
 
 def make_anchors(config: NetworkConfig) -> np.ndarray:
-    """Return (A, 7) float32 [x y z l w h yaw], A = H * W * classes * yaws, in this order; H and W
-    of config.head_grid, rows along y."""
+    """Return all anchors (A, 7) float32 [x y z l w h yaw].
+
+    A = H * W * classes * yaws, in this order, with (H, W) = config.head_grid and rows along y.
+    """
     height, width = config.head_grid
     x, y = (_centres(config.low[axis], config.high[axis], count, config.anchors_at)
             for axis, count in ((0, width), (1, height)))
@@ -22,7 +24,7 @@ def make_anchors(config: NetworkConfig) -> np.ndarray:
 
 
 def anchor_classes(config: NetworkConfig) -> np.ndarray:
-    """Return (A,) int64: which of config.classes each anchor is for."""
+    """Return the class of each anchor, (A,) int64 indices into config.classes."""
     height, width = config.head_grid
     return np.tile(np.repeat(np.arange(len(config.anchors)), len(config.yaws)), height * width)
 

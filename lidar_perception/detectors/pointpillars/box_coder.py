@@ -1,7 +1,6 @@
-"""Boxes from what the network predicts relative to an anchor (SECOND, Yan et al. 2018).
+"""Decoding of network outputs relative to anchors (SECOND, Yan et al. 2018).
 
-The angle is coded without its direction, which half of the circle it lies in: that is a bin of its
-own. targets.py has the inverse.
+Yaw is encoded modulo pi; the half of the circle is a separate bin. targets.py has the inverse.
 """
 
 from __future__ import annotations
@@ -12,10 +11,18 @@ import numpy as np
 
 
 def decode(codes: np.ndarray, bins: np.ndarray, anchors: np.ndarray, offset: float) -> np.ndarray:
-    """Return (N, 7) float32 boxes [x y z l w h yaw], yaw in [-pi, pi), of codes (N, 7) float32 and
-    bins (N,) relative to anchors (N, 7). Of the angle in codes only the line counts, bins say its
-    direction. Sizes are at most e^4 times the anchor's."""
-    with np.errstate(over="ignore", invalid="ignore"):  # of broken weights, which are reported
+    """Decode boxes (N, 7) float32 [x y z l w h yaw], yaw in [-pi, pi).
+
+    The angle in `codes` gives the axis of a box, `bins` the direction along it. Sizes are limited
+    to e^4 times the anchor's.
+
+    Args:
+        codes: (N, 7) float32.
+        bins: (N,) 0 or 1.
+        anchors: (N, 7).
+        offset: start of the bins, radians.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # broken weights are reported elsewhere
         diagonal = np.hypot(anchors[:, 3], anchors[:, 4])
         line = codes[:, 6] + anchors[:, 6] - offset
         yaw = line - np.floor(line / math.pi) * math.pi + offset + math.pi * bins.astype(line.dtype)

@@ -1,8 +1,8 @@
-"""What a network looks like: one dataclass for every version and size of EG-PointPillars.
+"""Configuration of all versions and sizes of EG-PointPillars.
 
-Paper B (Ahn, Kim, Park, CMC 2026, 87(1), 84) has PointPillars (v0) and four versions guided by
-ground segmentation and clustering. They are switches here; a checkpoint holds the dataclass as
-JSON, so that weights always come with their network.
+Paper B (Ahn, Kim, Park, CMC 2026, 87(1), 84) compares PointPillars (v0) with four versions guided
+by ground segmentation and clustering. The versions are switches of one dataclass. A checkpoint
+contains the dataclass as JSON, so weights and architecture cannot get separated.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ VERSIONS = {  # paper B, Table 3
     "v4": dict(remove_ground=True, cluster_ids=False, pseudo_map=True, neck="fpn"),
 }
 SIZES = {
-    # Lang et al., CVPR 2019; paper B: 2C = 64 channels in the new neck
+    # Lang et al., CVPR 2019; neck with 2C = 64 channels as in paper B
     "full": dict(pillar_channels=64, map_channels=(16, 32, 64), block_channels=(64, 128, 256),
                  block_layers=(3, 5, 5), deconv_channels=128, fpn_channels=64),
-    # the same grid with an eighth of the arithmetic, for two CPU cores
+    # the same grid with an eighth of the operations, for two CPU cores
     "compact": dict(pillar_channels=16, map_channels=(8, 8), block_channels=(32, 64, 96),
                     block_layers=(1, 3, 3), deconv_channels=32, fpn_channels=32),
 }
 
 
 class Range(TypedDict):
-    """What a network sees, fields of NetworkConfig."""
+    """Covered area of a network, two fields of NetworkConfig."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -40,24 +40,27 @@ class Range(TypedDict):
 
 AHEAD = Range(low=(0.0, -39.68, -3.0), high=(69.12, 39.68, 1.0))  # where KITTI has labels
 RANGES = {"ahead": AHEAD, "around": Range(low=(-51.2, -51.2, -3.0), high=(51.2, 51.2, 1.0))}
-# What one look of two is of around, with a network that was trained ahead: a half, and so much of
-# the other that no object is cut.
+# Range of each of the two passes that cover `around` with a network trained ahead: one half plus a
+# margin, so that no object is cut off.
 HALF = Range(low=(-5.12, -51.2, -3.0), high=(51.2, 51.2, 1.0))
 
-XY_SCALE = 0.02  # of networks that are trained here
+XY_SCALE = 0.02  # of networks trained with this package
 CHOICES = {"neck": ("deconv", "fpn"), "fusion": ("add", "concat"), "anchors_at": ("cells", "ends")}
 NORM_EPS = 1e-3  # of batch norms
 CODE, BINS = 7, 2  # numbers that describe a box, and halves of the circle of headings
-MAX_CELLS = 1 << 22  # of a grid: 100 m x 100 m of 5 cm; what is computed grows with it
+MAX_CELLS = 1 << 22  # of a grid, to bound computing time: about 100 m x 100 m at 5 cm
 MAX_LAYERS = 64
 
 
 @dataclass(frozen=True)
 class AnchorClass:
-    """The anchor boxes of one class, and the overlaps seen from above from which one is learned
-    as that class (matched) and below which as background (unmatched).
+    """Anchor boxes of one class.
 
-    size l w h and z of the centre in metres, from a sensor at SENSOR_HEIGHT.
+    Attributes:
+        size: length, width, height in metres.
+        z: z of the centre in metres, for a sensor at SENSOR_HEIGHT.
+        matched: bird's-eye-view IoU from which an anchor is a positive example in training.
+        unmatched: IoU below which an anchor is background.
     """
 
     name: str
@@ -67,32 +70,37 @@ class AnchorClass:
     unmatched: float
 
 
-# They stand on the ground.
+# All anchors stand on the ground.
 ANCHORS = tuple(AnchorClass(name, of.anchor, of.anchor[2] / 2 - SENSOR_HEIGHT, of.matched,
                             of.unmatched) for name, of in DETECTED.items())
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """A network. version and size are its name; the other fields say what it is.
+    """Architecture of a network. `version` and `size` name it; the other fields define it.
 
-    low, high: [x y z] of the corner points of what it sees, metres; cell: side of a pillar.
-    remove_ground: only points that are not ground come in; cluster_ids: each point has its
-    cluster's id, times id_scale, as a fifth input, 0 for ground and noise; pseudo_map: a branch
-    for the map of classified clusters. neck: 'deconv' (PointPillars) or 'fpn' (paper B, Eq. 1-8);
-    fusion in the fpn: 'add' or 'concat'. head_stride: of block_strides the first, as both necks
-    end at the finest block.
-
-    xy_scale: x and y of a point are multiplied by this before the first layer. With 1, as in the
-    papers and in imported weights, they are 50 times as large as the other inputs, and most of the
-    few channels of a compact network come to say where a pillar is, which its cell says already.
-
-    max_points: points of a pillar that are read, in the order of the cloud; 0 reads all. Imported
-    weights need it, and the next two. zero_row: a pillar with fewer points than max_points also has
-    a point whose inputs are all 0, as in code that pads pillars. middle_z: points come with their
-    height above the middle of the range, too. anchors_at: 'cells' puts anchors on the middle of the
-    head's cells, 'ends' spreads them evenly from low to high. direction_offset: where the two bins
-    of heading begin, rad.
+    Attributes:
+        remove_ground: the network reads only points that are not ground.
+        cluster_ids: the cluster id of a point, times id_scale, is a fifth input; 0 for ground and
+            noise.
+        pseudo_map: the network has a branch for the map of classified clusters.
+        neck: 'deconv' (PointPillars) or 'fpn' (paper B, Eq. 1-8). Both end at the resolution of the
+            first block.
+        fusion: 'add' or 'concat', in the fpn.
+        low, high: corners [x y z] of the range, metres.
+        cell: side of a pillar, metres.
+        xy_scale: factor of x and y before the first layer. With 1, as in the papers and in imported
+            weights, x and y are 50 times larger than the other inputs. A compact network then
+            spends most of its few channels on the position of the pillar, which the grid encodes
+            anyway.
+        max_points: number of points read per pillar, in the order of the cloud; 0: all. Imported
+            weights need this field and the next two.
+        zero_row: pillars with fewer than max_points points also have a point with all inputs 0, as
+            in code that pads pillars.
+        middle_z: the height above the middle of the range is another input of each point.
+        anchors_at: 'cells' places anchors at the centres of the head's cells, 'ends' spreads them
+            evenly from low to high.
+        direction_offset: start of the two heading bins, radians.
     """
 
     network: ClassVar[str] = "pointpillars"
@@ -156,7 +164,7 @@ class NetworkConfig:
 
     @property
     def title(self) -> str:
-        """Which PointPillars, for people."""
+        """Name of the variant, such as "v4 compact"."""
         return f"{self.version} {self.size}"
 
     @property
@@ -165,13 +173,13 @@ class NetworkConfig:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """(H, W): cells along y and along x."""
+        """Size (H, W): numbers of cells along y and along x."""
         return (round((self.high[1] - self.low[1]) / self.cell),
                 round((self.high[0] - self.low[0]) / self.cell))
 
     @property
     def head_grid(self) -> tuple[int, int]:
-        """(H, W) of the feature map that the head reads."""
+        """Size (H, W) of the feature map that the head reads."""
         stride = self.block_strides[0]
         return self.grid[0] // stride, self.grid[1] // stride
 
@@ -181,20 +189,27 @@ class NetworkConfig:
 
     @property
     def point_columns(self) -> int:
-        """x y z intensity, and the cluster id."""
+        """Number of columns of Pillars.points."""
         return 5 if self.cluster_ids else 4
 
     @property
     def offset_columns(self) -> int:
-        """x_c y_c z_c x_p y_p, and z_p."""
+        """Number of columns of Pillars.offsets."""
         return 6 if self.middle_z else 5
 
 
-def network_config(version: str = "v0", size: str = "full",
+def make_config(version: str = "v0", size: str = "full",
                    classes: tuple[str, ...] = tuple(DETECTED),
                    **changes: Any) -> NetworkConfig:
-    """The config of a version and size by name, for some of the classes that are detected, with
-    other fields changed. InputError for a name that is none."""
+    """Make the config of a version and size.
+
+    Args:
+        classes: names of classes with an anchor.
+        changes: other fields of NetworkConfig.
+
+    Raises:
+        InputError: a name is unknown, or the fields do not fit together.
+    """
     for name, choices in (version, VERSIONS), (size, SIZES):
         if name not in choices:
             raise InputError(f"there is no {name!r}; choose one of {', '.join(choices)}")

@@ -18,19 +18,21 @@ from lidar_perception.detectors.layer_weights import Misfit
 from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.detectors.normalized_view import NormalizedView, restore_detections
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
-from lidar_perception.detectors.pointpillars.expert import experts
+from lidar_perception.detectors.pointpillars.expert import run_experts
 from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams, PointPillarsParams
 from lidar_perception.detectors.pointpillars.prediction import Network
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
-from lidar_perception.detectors.pointpillars.sparse import SparseNetwork, unsupported
+from lidar_perception.detectors.pointpillars.sparse import SparseNetwork, find_unsupported_part
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.runs.threads import set_thread_count
 from lidar_perception.types import InputError, PointCloud
 
 
 class PointPillarsDetector(NetworkDetector):
-    """EG-PointPillars of any version as a detector, see contract.py. Ground and clusters are
-    computed where they are None and the version needs them."""
+    """EG-PointPillars of any version as a detector, see contract.py.
+
+    Ground and clusters are computed if they are None and the version needs them.
+    """
 
     group = "pointpillars"
     params: DetectorParams
@@ -62,7 +64,7 @@ class PointPillarsDetector(NetworkDetector):
         view = NormalizedView.of(frame, self.params.ground.sensor_pose, config.low, config.high,
                                  settings.intensity_scale)
         t1 = perf_counter()
-        columns = experts(view.frame, config, view.take(ground), view.take(cluster_ids),
+        columns = run_experts(view.frame, config, view.take(ground), view.take(cluster_ids),
                           self.params.ground, self.params.clustering)
         t2 = perf_counter()
         found = self.proposer.propose(view, *columns, settings.scores, settings.nms,
@@ -96,8 +98,7 @@ def load_detector(path: str | Path = "", device: str = "auto",
     """Load a detector from a checkpoint (.safetensors) or an exported network (.onnx).
 
     Args:
-        path: file of the weights; empty: the one that `params` name, or else the one of the
-            package.
+        path: file of the weights; empty: `params.pointpillars.weights`, by default the shipped one.
 
     Raises:
         InputError: the file is missing or not of the version and size in `params`, the device does
@@ -144,7 +145,7 @@ def _load_network(path: Path, device: str, params: PointPillarsParams) -> tuple[
     if device == CPU and params.engine != "torch" and not uses_16_bits(params.amp):
         with suppress(Misfit):  # torch finds out what does not fit
             header, tensors = read_arrays(path, NetworkConfig)
-            if unsupported(header.config) is None:
+            if find_unsupported_part(header.config) is None:
                 return header, SparseNetwork(header.config, tensors)
     from lidar_perception.detectors.pointpillars.network import load_network
     from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork

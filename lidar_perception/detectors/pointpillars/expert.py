@@ -1,7 +1,7 @@
-"""What the experts tell a network (paper B, Section 3): ground, clusters, a map of the clusters.
+"""Expert knowledge as network inputs (paper B, Section 3): ground, clusters, and a cluster map.
 
-Only the part of a cloud that the network sees is looked at. Columns that are known already, from
-the nodes ground_segmentation and clustering, are taken as they are.
+The experts process only points in the range of the network. Columns from earlier stages, such as
+the nodes ground_segmentation and clustering, are used unchanged.
 """
 
 from __future__ import annotations
@@ -22,72 +22,86 @@ from lidar_perception.ground.params import GroundParams
 from lidar_perception.groups import renumber_ids
 from lidar_perception.types import PointCloud
 
-MAP_KINDS = ("vehicle", "cyclist", "pedestrian")  # a channel each, however many classes there are
-# Into MAP_KINDS, by class, and last of what is of no class, which has no channel.
+MAP_KINDS = ("vehicle", "cyclist", "pedestrian")  # one channel each, whatever the classes
+# Index into MAP_KINDS by class; the last entry, -1, is for clusters without a class.
 CHANNELS = np.array([*(MAP_KINDS.index(row.moves_as) for row in TABLE), -1])
 
 
 @dataclass(frozen=True)
 class NetworkInput:
-    """points (N, 4 or 5) float32 [x y z intensity (cluster id)] as from a level sensor at
-    SENSOR_HEIGHT, metres; cluster_map (3, H, W) uint8, or None if the network has no such branch.
+    """Input arrays of a network.
+
+    Attributes:
+        points: (N, 4 or 5) float32 [x y z intensity (cluster id)] in a NormalizedView, metres.
+        cluster_map: (3, H, W) uint8; None if the network has no branch for it.
     """
 
     points: np.ndarray
     cluster_map: np.ndarray | None = None
 
 
-def network_input(seen: PointCloud, config: NetworkConfig, ground: np.ndarray | None = None,
+def make_network_input(view: PointCloud, config: NetworkConfig, ground: np.ndarray | None = None,
                   cluster_ids: np.ndarray | None = None,
                   ground_params: GroundParams = EXPERT_GROUND,
                   clustering: ClusteringParams = EXPERT_CLUSTERING) -> NetworkInput:
-    """The input arrays of a version, from the N points of a NormalizedView.
+    """Make the input arrays of a version from the N points of a NormalizedView.
 
-    ground (N,) bool and cluster_ids (N,) int, 0 = none, are computed if the version needs them and
-    they are None. The ids that are left are numbered anew from 1, in their order.
+    Args:
+        ground: (N,) bool; None: computed if the version needs it.
+        cluster_ids: (N,) int, 0 for no cluster; None: computed if the version needs it. The network
+            gets consecutive ids from 1, in the same order.
     """
-    ground, cluster_ids = experts(seen, config, ground, cluster_ids, ground_params, clustering)
+    ground, cluster_ids = run_experts(view, config, ground, cluster_ids, ground_params, clustering)
     if config.remove_ground:
         obstacles = np.flatnonzero(~np.asarray(ground, bool))
-        seen = seen.take(obstacles)
+        view = view.take(obstacles)
         cluster_ids = None if cluster_ids is None else cluster_ids.take(obstacles)
-    points = np.zeros((len(seen), config.point_columns), np.float32)
-    points[:, :3] = seen.xyz
-    if seen.intensity is not None:
-        points[:, 3] = seen.intensity
+    points = np.zeros((len(view), config.point_columns), np.float32)
+    points[:, :3] = view.xyz
+    if view.intensity is not None:
+        points[:, 3] = view.intensity
     if cluster_ids is None:
         return NetworkInput(points)
     cluster_ids, _ = renumber_ids(cluster_ids)
     if config.cluster_ids:
         points[:, 4] = cluster_ids
-    return NetworkInput(points, draw_clusters(seen.xyz, cluster_ids, config)
+    return NetworkInput(points, draw_clusters(view.xyz, cluster_ids, config)
                         if config.pseudo_map else None)
 
 
-def experts(seen: PointCloud, config: NetworkConfig, ground: np.ndarray | None = None,
-            cluster_ids: np.ndarray | None = None, ground_params: GroundParams = EXPERT_GROUND,
-            clustering: ClusteringParams = EXPERT_CLUSTERING,
-            ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """ground (N,) bool and cluster_ids (N,) int of the N points of a NormalizedView, computed where
-    they are None and the version needs them; ids are None where it needs none."""
+def run_experts(view: PointCloud, config: NetworkConfig, ground: np.ndarray | None = None,
+                cluster_ids: np.ndarray | None = None, ground_params: GroundParams = EXPERT_GROUND,
+                clustering: ClusteringParams = EXPERT_CLUSTERING,
+                ) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return ground (N,) bool and cluster ids (N,) int of the N points of a NormalizedView.
+
+    They are computed if they are None and the version needs them. The ids are None if the version
+    does not use clusters.
+    """
     needs_clusters = config.cluster_ids or config.pseudo_map
     if not needs_clusters:
         cluster_ids = None
     missing = needs_clusters and cluster_ids is None
     if ground is None and (config.remove_ground or missing):
-        ground = segment_view_ground(seen, ground_params)
+        ground = segment_view_ground(view, ground_params)
     if missing:
         assert ground is not None
-        cluster_ids = cluster_obstacles(seen.xyz, ground, clustering)
+        cluster_ids = cluster_obstacles(view.xyz, ground, clustering)
     return ground, cluster_ids
 
 
 def draw_clusters(xyz: np.ndarray, cluster_ids: np.ndarray, config: NetworkConfig) -> np.ndarray:
-    """(3, H, W) uint8, 0 or 1, H along y: the cluster 2D pseudo-map (paper B, Section 3.1.2).
+    """Draw the 2D pseudo-map of clusters (paper B, Section 3.1.2).
 
-    Clusters 1..K of points (N, 3) with ids (N,) are classified by the diagonal of their smallest
-    rectangle, and drawn as filled ellipses into the channel of its kind (MAP_KINDS): the
-    cells whose middle lies in the ellipse, and the one that holds its centre.
+    Clusters are classified by the diagonal of their minimum-area rectangle and drawn as filled
+    ellipses into the channel of their kind. An ellipse fills the cells with their centre inside it,
+    and the cell of its own centre.
+
+    Args:
+        xyz: (N, 3) points with cluster ids (N,), 1..K.
+
+    Returns:
+        (3, H, W) uint8, 0 or 1, channels as in MAP_KINDS, rows along y.
     """
     channels = CHANNELS[classify_by_diagonal(fit_boxes(xyz, cluster_ids, "min_area"))]
     image = np.zeros((len(MAP_KINDS), *config.grid), np.uint8)

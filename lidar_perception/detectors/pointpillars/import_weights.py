@@ -1,15 +1,14 @@
-"""PointPillars weights of OpenPCDet and mmdetection3d (1.x) as checkpoints of ours.
+"""Import of PointPillars weights from OpenPCDet and mmdetection3d (1.x).
 
-Both hold the same network under other names. What differs is converted where it can be, exactly:
+Both projects store the same network under other names. The differences are converted exactly:
 
-- Their points have a tenth input, the height above the middle of the range (middle_z of the
-  config). mmdetection3d puts x_p, y_p and z_p in the place of x, y and z: the weights of both are
-  added up.
-- They read the first 32 points of a pillar and fill it up with zeros that take part in the maximum:
-  max_points and zero_row of the config.
-- OpenPCDet spreads anchors from edge to edge, mmdetection3d puts them on the middles of cells; each
-  has its own origin of the two heading bins, and its own height of anchors. Boxes of mmdetection3d
-  stand on their z, but are coded by their centres, as ours are.
+- Points have a tenth input, the height above the middle of the range (middle_z of the config).
+  mmdetection3d replaces x, y and z by x_p, y_p and z_p; the weights of both are added.
+- A pillar has its first 32 points and is pad_channels with zeros that take part in the maximum
+  (max_points and zero_row of the config).
+- OpenPCDet spreads anchors from edge to edge, mmdetection3d places them at the centres of cells.
+  The origin of the two heading bins and the height of anchors differ too. In mmdetection3d the z of
+  a box is that of its bottom, but codes are relative to centres, as here.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from lidar_perception.detectors.pointpillars.config import (
     ANCHORS,
     AnchorClass,
     NetworkConfig,
-    network_config,
+    make_config,
 )
 from lidar_perception.detectors.pointpillars.network import PointPillars, make_network
 from lidar_perception.types import InputError
@@ -38,7 +37,7 @@ COLUMNS = 10  # x y z i, x_c y_c z_c, x_p y_p z_p
 
 @dataclass(frozen=True)
 class Project:
-    """How one project names and reads its PointPillars."""
+    """Names and conventions of the PointPillars of one project."""
 
     name: str
     points: str            # prefix of the linear layer of points and its norm
@@ -50,7 +49,7 @@ class Project:
     bottoms: dict[str, float]  # z of the bottom face of the anchors
     anchors_at: str
     direction_offset: float
-    centred_xyz: bool      # x_p y_p z_p stand in the place of x y z
+    centred_xyz: bool      # inputs are x_p y_p z_p instead of x y z
 
 
 PROJECTS = (
@@ -69,48 +68,57 @@ PROJECTS = (
 
 def import_weights(path: str | Path, classes: tuple[str, ...] = ()) -> tuple[NetworkConfig,
                                                                             PointPillars, str]:
-    """Config, network (v0 full) and the project's name of a .pth file with KITTI's range and 0.16 m
-    pillars. classes: in the order of training, if it is not the project's own. InputError for
-    another network, naming the first part that does not fit."""
+    """Import a .pth file of a network with KITTI's range and 0.16 m pillars.
+
+    Args:
+        classes: classes in the order of training; empty: the order of the project.
+
+    Returns:
+        Config, network (v0 full), and name of the project.
+
+    Raises:
+        InputError: the file contains another network; the message names the first part that
+            differs.
+    """
     path = Path(path)
-    state = _state(path)
+    state = _load_state(path)
     project = next((p for p in PROJECTS if f"{p.points}linear.weight" in state), None)
     if project is None:
         raise InputError(f"{path} is no PointPillars of {' or '.join(p.name for p in PROJECTS)}: "
                          f"it has no tensor {PROJECTS[0].points}linear.weight")
-    config = _config(project, _anchors_per_cell(state, project, path), classes, path)
+    config = _make_config(project, _count_anchors(state, project, path), classes, path)
     network = make_network(config)
-    taken, converted = {}, network.state_dict()
-    for ours, theirs in _names(project, config).items():
+    used, converted = {}, network.state_dict()
+    for ours, theirs in _map_names(project, config).items():
         if theirs.endswith("num_batches_tracked") and theirs not in state:
-            continue  # torch before 0.4.1 had none
-        taken[theirs] = _tensor(state, theirs, path)
-        converted[ours] = taken[theirs]
+            continue  # missing in files of torch before 0.4.1
+        used[theirs] = _get_tensor(state, theirs, path)
+        converted[ours] = used[theirs]
     linear = f"{project.points}linear.weight"
-    taken[linear] = _tensor(state, linear, path)
-    converted["pillar_net.linear.weight"] = _inputs_of_ours(taken[linear], project, path)
+    used[linear] = _get_tensor(state, linear, path)
+    converted["pillar_net.linear.weight"] = _convert_inputs(used[linear], project, path)
     for name, wanted in network.state_dict().items():
         if converted[name].shape != wanted.shape:
-            raise InputError(f"{path}: {name} would be {tuple(converted[name].shape)}, where "
-                             f"PointPillars has {tuple(wanted.shape)}")
-    left = [name for name in state if name not in taken and state[name].is_floating_point()]
+            raise InputError(f"{path}: {name} has the shape {tuple(converted[name].shape)}, "
+                             f"PointPillars needs {tuple(wanted.shape)}")
+    left = [name for name in state if name not in used and state[name].is_floating_point()]
     if left:
         raise InputError(f"{path} has {left[0]} and {len(left) - 1} more tensors that PointPillars "
-                         "has no place for; it is another network")
+                         "does not have; it is another network")
     network.load_state_dict(converted)
     return config, network, project.name
 
 
-def _state(path: Path) -> dict[str, Tensor]:
-    """The tensors of a .pth file, which is read without running what it may hold."""
+def _load_state(path: Path) -> dict[str, Tensor]:
+    """Load the tensors of a .pth file without running any code in it."""
     if not path.is_file():
         raise InputError(f"there is no file {path}")
     try:
         content: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # of a damaged file torch's reader may raise any
+    except Exception as error:  # torch raises many types for damaged files
         raise InputError(f"{path} cannot be read as weights only: "
                          f"{str(error).splitlines()[0] if str(error) else type(error).__name__}; "
-                         "save its state_dict alone with torch.save and take that file") from None
+                         "save only its state_dict with torch.save and use that file") from None
     for key in "model_state", "state_dict":
         if isinstance(content, dict) and isinstance(content.get(key), dict):
             content = content[key]
@@ -121,22 +129,23 @@ def _state(path: Path) -> dict[str, Tensor]:
     return state
 
 
-def _tensor(state: dict[str, Tensor], name: str, path: Path) -> Tensor:
+def _get_tensor(state: dict[str, Tensor], name: str, path: Path) -> Tensor:
     if name not in state:
         raise InputError(f"{path} has no tensor {name}; it is another network")
     return state[name].float() if state[name].is_floating_point() else state[name]
 
 
-def _anchors_per_cell(state: dict[str, Tensor], project: Project, path: Path) -> int:
-    """Anchors per cell, from the seven numbers of each."""
-    outputs = len(_tensor(state, f"{project.head[1]}.weight", path))
+def _count_anchors(state: dict[str, Tensor], project: Project, path: Path) -> int:
+    """Return the number of anchors per cell, from the seven outputs of each."""
+    outputs = len(_get_tensor(state, f"{project.head[1]}.weight", path))
     if outputs % 14:
         raise InputError(f"{path}: {project.head[1]} has {outputs} outputs, which is not 7 for "
                          "each class and two headings")
     return outputs // 7
 
 
-def _config(project: Project, per_cell: int, classes: tuple[str, ...], path: Path) -> NetworkConfig:
+def _make_config(project: Project, per_cell: int, classes: tuple[str, ...],
+                 path: Path) -> NetworkConfig:
     names = classes or project.classes
     if not classes and per_cell == 2:
         names = ("Car",)
@@ -149,14 +158,14 @@ def _config(project: Project, per_cell: int, classes: tuple[str, ...], path: Pat
     anchors = tuple(AnchorClass(name, known[name].size, project.bottoms[name]
                                 + known[name].size[2] / 2, known[name].matched,
                                 known[name].unmatched) for name in names)
-    return network_config("v0", "full", xy_scale=1.0, anchors=anchors, max_points=MAX_POINTS,
+    return make_config("v0", "full", xy_scale=1.0, anchors=anchors, max_points=MAX_POINTS,
                           zero_row=True, middle_z=True, yaws=(0.0, 1.57),
                           anchors_at=project.anchors_at,
                           direction_offset=project.direction_offset)
 
 
-def _names(project: Project, config: NetworkConfig) -> dict[str, str]:
-    """Our names to theirs, of all tensors but the linear layer of points."""
+def _map_names(project: Project, config: NetworkConfig) -> dict[str, str]:
+    """Map our names of tensors to theirs, except that of the linear layer of points."""
     names = {f"pillar_net.norm.{part}": f"{project.points}norm.{part}"
              for part in (*NORM_PARTS, "num_batches_tracked")}
 
@@ -175,13 +184,13 @@ def _names(project: Project, config: NetworkConfig) -> dict[str, str]:
     return names
 
 
-def _inputs_of_ours(weight: Tensor, project: Project, path: Path) -> Tensor:
-    """weight (C, 10) for our inputs."""
+def _convert_inputs(weight: Tensor, project: Project, path: Path) -> Tensor:
+    """Convert weights (C, 10) to the inputs of this package."""
     if weight.shape[1] != COLUMNS:
-        older = (" Weights of mmdetection3d 0.x have 9, and boxes of another order."
+        older = (" Weights of mmdetection3d 0.x have 9, and another order of box numbers."
                  if project.centred_xyz else "")
-        raise InputError(f"{path}: the points have {weight.shape[1]} inputs; only x y z intensity "
-                         f"and the offsets from mean and middle, {COLUMNS}, can be read.{older}")
+        raise InputError(f"{path}: the points have {weight.shape[1]} inputs; supported are "
+                         f"{COLUMNS}: x y z intensity and the offsets from mean and middle.{older}")
     if project.centred_xyz:
         weight = weight.clone()
         weight[:, 7:10] += weight[:, 0:3]

@@ -1,4 +1,4 @@
-"""What a network is trained to lower (Lang et al., Section 3.2; focal loss: Lin et al. 2017)."""
+"""Training losses of PointPillars (Lang et al., Section 3.2; focal loss: Lin et al. 2017)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lidar_perception.detectors.pointpillars.targets import IGNORED, Targets
 
 CLASS_WEIGHT, BOX_WEIGHT, DIRECTION_WEIGHT = 1.0, 2.0, 0.2
 ALPHA, GAMMA = 0.25, 2.0
-SMOOTH = 1 / 9  # from here on the box loss is linear
+SMOOTH = 1 / 9  # the box loss is linear above this error
 
 
 class Losses(NamedTuple):
@@ -26,13 +26,17 @@ class Losses(NamedTuple):
 
 
 def detection_loss(outputs: Outputs, targets: Targets, classes_of: Tensor) -> Losses:
-    """Scores: the focal losses of the anchors of each class, divided by the number of those that
-    have an object, averaged over the classes. Boxes and directions: the mean over all anchors that
-    have an object. Numbers are at least 1 a cloud. classes_of (A,): the class of each
-    anchor, see anchors.anchor_classes.
+    """Compute the losses of B clouds.
 
-    So classes weigh alike where they are told from the background. Lang et al. divide scores by
-    the anchors of all classes, too; a car is on ten times as many of them as a pedestrian.
+    The focal loss of each class is divided by its number of positive anchors, then averaged over
+    the classes. The losses of boxes and directions are means over all positive anchors. Numbers of
+    anchors are at least 1 per cloud.
+
+    This gives all classes the same weight. Lang et al. divide by the positive anchors of all
+    classes, but a car has ten times as many as a pedestrian.
+
+    Args:
+        classes_of: (A,) class of each anchor, see anchors.anchor_classes.
     """
     positive = targets.labels >= 0                                       # (B, A)
     logits = outputs.logits.float()
@@ -45,7 +49,7 @@ def detection_loss(outputs: Outputs, targets: Targets, classes_of: Tensor) -> Lo
     number = count.sum().clamp(min=clouds)
     codes, bins = targets.codes[positive], targets.bins[positive]        # (P, 7), (P,)
     found = outputs.codes.float()[positive]
-    # sin(a - b), so that a box turned by half a circle costs nothing here
+    # sin(a - b): rotation by half a turn is left to the direction loss
     difference = torch.cat([found[:, :6] - codes[:, :6],
                             torch.sin(found[:, 6:] - codes[:, 6:])], dim=1)
     boxes = functional.smooth_l1_loss(difference, torch.zeros_like(difference), beta=SMOOTH,
@@ -57,7 +61,7 @@ def detection_loss(outputs: Outputs, targets: Targets, classes_of: Tensor) -> Lo
 
 
 def focal_loss(logits: Tensor, wanted: Tensor) -> Tensor:
-    """Elementwise; wanted is 0 or 1."""
+    """Return the elementwise focal loss; `wanted` is 0 or 1."""
     entropy = functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
     score = torch.sigmoid(logits)
     miss = wanted * (1 - score) + (1 - wanted) * score

@@ -1,10 +1,10 @@
-"""PointPillars (Lang et al., CVPR 2019) and EG-PointPillars (paper B), the whole network.
+"""The network of PointPillars (Lang et al., CVPR 2019) and EG-PointPillars (paper B).
 
     points -> PillarNet -> pseudo-image --+-> blocks -> neck -> head -> scores, codes, directions
     map of clusters -> MapNet (V4) -------+
 
 B clouds, N points, H x W pillars, C channels, K classes, A anchors. Images are channels-last in
-memory. Assigning targets, losses and decoding boxes are elsewhere.
+memory. Targets, losses and decoding are in targets.py, losses.py and box_coder.py.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Outputs(NamedTuple):
 
 
 class ConvNormRelu(nn.Sequential):
-    """A convolution, batch norm, ReLU."""
+    """Convolution, batch norm and ReLU."""
 
     def __init__(self, conv: Conv):
         super().__init__(conv, nn.BatchNorm2d(conv.out_channels, NORM_EPS, MOMENTUM),
@@ -47,12 +47,12 @@ class ConvNormRelu(nn.Sequential):
 
 
 def conv3x3(channels: int, out: int, stride: int = 1) -> ConvNormRelu:
-    """A 3 x 3 convolution, norm and ReLU."""
+    """Return a 3 x 3 convolution with batch norm and ReLU."""
     return ConvNormRelu(nn.Conv2d(channels, out, 3, stride, padding=1, bias=False))
 
 
 class PillarNet(nn.Module):
-    """A linear layer for each point, and the largest value of each pillar, in its cell."""
+    """Linear layer on each point, then the maximum per pillar, written into its cell."""
 
     def __init__(self, config: NetworkConfig):
         super().__init__()
@@ -62,9 +62,9 @@ class PillarNet(nn.Module):
         self.norm: nn.Module = nn.BatchNorm1d(config.pillar_channels, NORM_EPS, MOMENTUM)
 
     @torch.autocast("cuda", enabled=False)
-    @torch.autocast("cpu", enabled=False)  # where x is 60 m, 16 bits would leave 25 cm of it
+    @torch.autocast("cpu", enabled=False)  # 16 bits would round x = 60 m to 25 cm
     def forward(self, pillars: Pillars[Tensor]) -> Tensor:
-        # The clusters' numbers come last, so that versions with and without share a beginning.
+        # Cluster ids come last, so that versions with and without them share the first inputs.
         points = pillars.points
         inputs = torch.cat([points[:, :2] * self.config.xy_scale, points[:, 2:4], pillars.offsets,
                             points[:, 4:] * self.config.id_scale], dim=1)      # (N, 9 to 11)
@@ -74,12 +74,13 @@ class PillarNet(nn.Module):
         image = values.new_zeros(count, values.shape[1])           # (B * H * W, C), empty is 0
         if self.config.zero_row:
             image = self._zero_rows(image, pillars.cells, inputs[:1])
-        # No value is below 0, so the zeros of an empty pillar take nothing from a full one.
+        # Values are never below 0, so the initial zeros do not affect the maximum.
         image.scatter_reduce_(0, pillars.cells[:, None].expand_as(values), values, "amax")
         return image.view(pillars.batch, height, width, -1).permute(0, 3, 1, 2)  # (B, C, H, W)
 
     def _zero_rows(self, image: Tensor, cells: Tensor, like: Tensor) -> Tensor:
-        """image (B * H * W, C) with the value of an all-zero point where a pillar is not full."""
+        """Return image (B * H * W, C) with the value of an all-zero point in pillars that have
+        fewer than max_points points."""
         ones = torch.ones_like(cells, dtype=image.dtype)
         sizes = image.new_zeros(len(image)).scatter_add(0, cells, ones)
         partly = ((sizes > 0) & (sizes < self.config.max_points))[:, None]
@@ -88,7 +89,7 @@ class PillarNet(nn.Module):
 
 
 class MapNet(nn.Sequential):
-    """Cluster Map Feature Net (paper B, Section 3.1.2): 3 channels, one a class, to C."""
+    """Cluster Map Feature Net (paper B, Section 3.1.2), from 3 channels to C."""
 
     def __init__(self, channels: Sequence[int]):
         super().__init__(*(conv3x3(a, b) for a, b in zip((3, *channels), channels)))
@@ -99,7 +100,8 @@ class MapNet(nn.Sequential):
 
 
 class DeconvNeck(nn.Module):
-    """PointPillars' neck: every block's map up to the first one's size, side by side."""
+    """Neck of PointPillars: upsample the map of every block to the first one's size and
+    concatenate them."""
 
     def __init__(self, channels: Sequence[int], strides: Sequence[int], out: int):
         super().__init__()
@@ -114,8 +116,8 @@ class DeconvNeck(nn.Module):
 
 
 class FpnNeck(nn.Module):
-    """The neck of V1 to V4 (paper B, Eq. 1 to 8): from the coarsest map, each is doubled
-    bilinearly and joined with the next finer one."""
+    """Neck of V1 to V4 (paper B, Eq. 1 to 8): starting from the coarsest map, upsample bilinearly
+    and fuse with the next finer map."""
 
     def __init__(self, channels: Sequence[int], strides: Sequence[int], out: int, fusion: str):
         super().__init__()
@@ -136,8 +138,7 @@ class FpnNeck(nn.Module):
 class Head(nn.Module):
     """Single-shot head: one 1 x 1 convolution each for class, box and heading.
 
-    A box is needed only where a class has a score, so a detector asks for scores everywhere and
-    for boxes at a few anchors.
+    A detector evaluates scores at all anchors, and boxes only at the few with a high score.
     """
 
     def __init__(self, channels: int, per_cell: int, classes: int):
@@ -148,7 +149,7 @@ class Head(nn.Module):
         self.directions = nn.Conv2d(channels, per_cell * BINS, 1)
         nn.init.constant_(_bias(self.scores), -math.log((1 - PRIOR) / PRIOR))
         for layer, std in ((self.scores, 0.01), (self.codes, 0.001)):
-            if not layer.weight.is_meta:  # there it would load torch's compiler: 2 s, no numbers
+            if not layer.weight.is_meta:  # on meta, normal_ would import torch's compiler (2 s)
                 nn.init.normal_(layer.weight, std=std)
 
     def forward(self, features: Tensor) -> Outputs:
@@ -157,17 +158,20 @@ class Head(nn.Module):
                        _by_anchor(self.directions(features), BINS))
 
     def logits(self, features: Tensor) -> Tensor:
-        """(B, A, K) as in forward."""
+        """Return the logits (B, A, K) of forward."""
         return _by_anchor(self.scores(features), self.classes)
 
     def boxes_at(self, features: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
-        """codes (M, 7) and directions (M, 2) of anchors (M,) of the only cloud."""
+        """Return codes (M, 7) and directions (M, 2) at anchors (M,) of a single cloud."""
         rows = features[0].flatten(1)[:, anchors // self.per_cell].T  # (M, C)
         return self.boxes_of(rows, anchors % self.per_cell)
 
     def boxes_of(self, rows: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """Return codes (M, 7) and directions (M, 2) of anchors number (M,) of their cells, from
-        the features (M, C) of these cells."""
+        """Return codes (M, 7) and directions (M, 2) from the features (M, C) of M cells.
+
+        Args:
+            numbers: (M,) index of the anchor within its cell.
+        """
         def one(conv: nn.Conv2d, width: int) -> Tensor:
             weight = conv.weight.view(self.per_cell, width, -1)[numbers]  # (M, width, C)
             bias = _bias(conv).view(self.per_cell, width)[numbers]
@@ -177,17 +181,17 @@ class Head(nn.Module):
 
 
 def _bias(conv: nn.Conv2d) -> Tensor:
-    assert conv.bias is not None  # the head's have one
+    assert conv.bias is not None  # all convolutions of the head have a bias
     return conv.bias
 
 
 def _by_anchor(x: Tensor, width: int) -> Tensor:
-    """(B, P * width, H, W), P anchors per cell, to (B, H * W * P, width)."""
+    """Reshape (B, P * width, H, W), with P anchors per cell, to (B, H * W * P, width)."""
     return x.permute(0, 2, 3, 1).reshape(len(x), -1, width)
 
 
 class PointPillars(nn.Module):
-    """The network of parts that fit together; make_network builds them from a config."""
+    """The complete network; make_network builds its parts from a config."""
 
     def __init__(self, pillar_net: PillarNet, map_net: MapNet | None,
                  blocks: Sequence[nn.Module], neck: DeconvNeck | FpnNeck, head: Head):
@@ -196,7 +200,8 @@ class PointPillars(nn.Module):
         self.blocks, self.neck, self.head = nn.ModuleList(blocks), neck, head
 
     def features(self, pillars: Pillars[Tensor], maps: Tensor | None = None) -> Tensor:
-        """(B, neck.channels, H/2, W/2); maps (B, 3, H, W) uint8 for V4."""
+        """Return the input of the head, (B, neck.channels, H/2, W/2); maps (B, 3, H, W) uint8 are
+        for V4."""
         x = self.pillar_net(pillars)                            # (B, C, H, W)
         if self.map_net is not None:
             x = torch.cat([x, self.map_net(maps)], dim=1)       # (B, C + C', H, W)
@@ -211,7 +216,7 @@ class PointPillars(nn.Module):
 
 
 def make_network(config: NetworkConfig) -> PointPillars:
-    """A network with random weights, in training mode."""
+    """Make a network with random weights, in training mode."""
     map_net = MapNet(config.map_channels) if config.pseudo_map else None
     channels = config.pillar_channels + (config.map_channels[-1] if config.pseudo_map else 0)
     blocks = []
@@ -229,12 +234,12 @@ def make_network(config: NetworkConfig) -> PointPillars:
 
 
 def channels_last(network: Net) -> Net:
-    """The network itself, its weights in the order in which its images are in memory."""
-    return cast(Any, network).to(memory_format=torch.channels_last)  # torch's types forget it
+    """Convert the weights of a network, in place, to the memory format of its images."""
+    return cast(Any, network).to(memory_format=torch.channels_last)  # missing in torch's stubs
 
 
-def fused(network: PointPillars) -> PointPillars:
-    """A copy for inference, with every batch norm inside the layer before it."""
+def fuse_norms(network: PointPillars) -> PointPillars:
+    """Return a copy for inference with every batch norm folded into the layer before it."""
     network = copy.deepcopy(network).eval()
     for module in network.modules():
         if isinstance(module, ConvNormRelu):
@@ -250,6 +255,9 @@ def fused(network: PointPillars) -> PointPillars:
 
 def load_network(path: str | Path,
                  expected: NetworkConfig | None = None) -> tuple[Header, PointPillars]:
-    """Header and network of a checkpoint, in float32 on the CPU, in training mode. InputError if
-    the file cannot be used, or holds another network than expected."""
+    """Load a checkpoint: header, and network in float32 on the CPU, in training mode.
+
+    Raises:
+        InputError: the file cannot be used, or its config differs from `expected`.
+    """
     return load_checkpoint(path, NetworkConfig, make_network, expected)

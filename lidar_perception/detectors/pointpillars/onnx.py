@@ -1,8 +1,8 @@
-"""Networks as ONNX: export, and ONNX Runtime in the place of torch.
+"""ONNX export, and inference with ONNX Runtime.
 
-The graph begins with the points, already sorted into pillars, and ends with the head's outputs. It
-has one loop-free operation that is not in every runtime, ScatterElements with reduction max (opset
-18). Pillars and boxes are made outside.
+The inputs of the graph are points that are already assigned to pillars; the outputs are those of
+the head. Pillars and boxes are computed outside the graph. It needs ScatterElements with reduction
+max (opset 18), which not every runtime has.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from lidar_perception.detectors.checkpoint import KEY, Header
 from lidar_perception.detectors.pointpillars.config import BINS, CODE, NetworkConfig
-from lidar_perception.detectors.pointpillars.network import PointPillars, fused
+from lidar_perception.detectors.pointpillars.network import PointPillars, fuse_norms
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 from lidar_perception.detectors.pointpillars.prediction import Prediction
 from lidar_perception.runs.files import write_bytes
@@ -27,12 +27,12 @@ from lidar_perception.runs.threads import thread_count
 from lidar_perception.types import InputError
 
 OPSET = 18
-COUNT = 100  # points of an example
+COUNT = 100  # points of the example input
 OUTPUTS = ["logits", "codes", "directions"]
 
 
 class OneCloud(nn.Module):
-    """The network for one cloud, with tensors only."""
+    """The network for one cloud, with tensors as inputs and outputs."""
 
     def __init__(self, network: PointPillars, grid: tuple[int, int]):
         super().__init__()
@@ -44,7 +44,7 @@ class OneCloud(nn.Module):
 
 
 def _inputs(config: NetworkConfig) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """The type and the shape of each input, of COUNT points."""
+    """Return type and shape of each input, for COUNT points."""
     inputs: dict[str, tuple[str, tuple[int, ...]]] = {
         "points": ("float", (COUNT, config.point_columns)),
         "offsets": ("float", (COUNT, config.offset_columns)), "cells": ("int64", (COUNT,))}
@@ -54,10 +54,15 @@ def _inputs(config: NetworkConfig) -> dict[str, tuple[str, tuple[int, ...]]]:
 
 
 def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None:
-    """Write network for one cloud: points (N, 4 or 5), offsets (N, 5 or 6) float32 and cells (N,)
-    int64 of pillars.Pillars, for V4 cluster_map (1, 3, H, W) uint8, to logits (1, A, K), codes
-    (1, A, 7), directions (1, A, 2). The header is metadata. InputError without the packages of
-    [onnx]."""
+    """Export a network for one cloud to ONNX, with its header as metadata.
+
+    Inputs are points (N, 4 or 5), offsets (N, 5 or 6) float32 and cells (N,) int64 as in
+    pillars.Pillars, and for V4 cluster_map (1, 3, H, W) uint8. Outputs are logits (1, A, K), codes
+    (1, A, 7) and directions (1, A, 2).
+
+    Raises:
+        InputError: the packages of the extra [onnx] are not installed.
+    """
     try:
         import onnx
         import onnxscript  # noqa: F401
@@ -68,15 +73,15 @@ def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None
     inputs = {name: torch.zeros(shape, dtype=getattr(torch, kind))
               for name, (kind, shape) in _inputs(config).items()}
     inputs["cells"] += torch.arange(COUNT)
-    free = {name: None if name == "cluster_map" else
-            {0: torch.export.Dim("points_in_range", min=1)} for name in inputs}
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision
+    dynamic = {name: None if name == "cluster_map" else
+               {0: torch.export.Dim("points_in_range", min=1)} for name in inputs}
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is missing
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            OneCloud(fused(network), config.grid).eval(), tuple(inputs.values()), dynamo=True,
+            OneCloud(fuse_norms(network), config.grid).eval(), tuple(inputs.values()), dynamo=True,
             verbose=False, opset_version=OPSET, input_names=list(inputs), output_names=OUTPUTS,
-            dynamic_shapes=free)
+            dynamic_shapes=dynamic)
     assert program is not None  # as dynamo is True
     model = program.model_proto
     onnx.helper.set_model_props(model, {KEY: header.to_json()})
@@ -97,7 +102,11 @@ class OnnxNetwork:
 
     @staticmethod
     def load(path: str | Path) -> tuple[Header, OnnxNetwork]:
-        """Header and network. InputError without onnxruntime, or for another file."""
+        """Load the header and the network of an exported file.
+
+        Raises:
+            InputError: onnxruntime is not installed, or the file is missing or invalid.
+        """
         try:
             import onnxruntime
         except ImportError:
@@ -124,7 +133,7 @@ class OnnxNetwork:
         return header, OnnxNetwork(session, str(path), header.config)
 
     def to(self, device: str) -> None:
-        """Stay on the CPU."""
+        """Do nothing: the network stays on the CPU."""
 
     def __call__(self, pillars: Pillars[np.ndarray], maps: np.ndarray | None) -> Prediction:
         given = dict(points=pillars.points, offsets=pillars.offsets, cells=pillars.cells,

@@ -1,4 +1,4 @@
-"""Parameters of the detector: flags, ROS parameters and docs are made from these fields."""
+"""Parameters of the detector, the source of ROS parameters, command line options and docs."""
 
 from __future__ import annotations
 
@@ -16,28 +16,29 @@ from lidar_perception.param_fields import param
 from lidar_perception.robot.params import CropParams
 from lidar_perception.wire.params import InputParams
 
-STEPS = ("preprocess", "experts", "network", "postprocess")  # of which each has its time
+STEPS = ("preprocess", "experts", "network", "postprocess")  # keys of the timings
 
 
 @dataclass(frozen=True)
 class PointPillarsParams(NetworkParams):
-    """Which PointPillars, where it runs, and what counts as a detection."""
+    """Network, device and thresholds of PointPillars."""
 
     weights: str = param("", "Checkpoint (.safetensors) or exported network (.onnx); empty: the "
-                         "one that comes with the package.", fixed=True)
+                         "shipped one.", fixed=True)
     version: str = param("auto", "EG-PointPillars version: v0 (PointPillars), v1 ... v4. auto: "
-                         "what the weights are; v4 without weights.",
+                         "that of the weights, by default v4.",
                          choices=("auto", "v0", "v1", "v2", "v3", "v4"), fixed=True)
     size: str = param("auto", "full: the paper's network, for a GPU. compact: for two CPU cores. "
-                      "auto: what the weights are; compact without weights.",
+                      "auto: that of the weights, by default compact.",
                       choices=("auto", "full", "compact"), fixed=True)
     range: str = make_range_param()
     amp: str = make_amp_param()
     engine: str = make_engine_param()
 
 
-# The experts of paper B: Patchwork++ and DBSCAN, of which it gives no numbers. Ours, chosen on
-# simulated scans, keep cars in one piece; paper A's, which are for pedestrians, break them up.
+# The experts of paper B are Patchwork++ and DBSCAN, without parameters. These parameters were
+# chosen on simulated scans and keep a car in one cluster; those of paper A, for pedestrians, split
+# cars.
 EXPERT_GROUND = GroundParams(method="patchwork")
 EXPERT_CLUSTERING = ClusteringParams(density=FULL_DENSITY, dbscan=DbscanParams(
     eps=(0.5, 0.7, 1.0), min_samples=5))
@@ -46,7 +47,7 @@ INPUT = InputParams()
 
 @dataclass(frozen=True)
 class DetectorParams:
-    """All groups of the detector; ground and clustering are its experts."""
+    """All parameter groups of the detector. `ground` and `clustering` configure its experts."""
 
     input: InputParams = INPUT
     crop: CropParams = CropParams()

@@ -1,4 +1,4 @@
-"""Points of several clouds to pillars, in torch, on any device."""
+"""Assignment of the points of several clouds to pillars, in torch, on any device."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ from lidar_perception.detectors.pointpillars.pillars import Pillars
 
 
 def make_pillar_batch(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillars[Tensor]:
-    """Return the pillars of clouds, each (N_b, config.point_columns) float32 on one device; see
-    make_pillars."""
+    """Assign the points of clouds to pillars, see make_pillars.
+
+    Args:
+        clouds: each (N_b, config.point_columns) float32, all on one device.
+    """
     points = torch.cat(list(clouds))
     sizes = torch.tensor([len(cloud) for cloud in clouds], device=points.device)
     sample = torch.repeat_interleave(sizes)
     low, high = points.new_tensor(config.low), points.new_tensor(config.high)
-    inside = ((points[:, :3] >= low) & (points[:, :3] < high)).all(dim=1)  # NaN is not
+    inside = ((points[:, :3] >= low) & (points[:, :3] < high)).all(dim=1)  # False for NaN
     inside &= torch.isfinite(points[:, 3:]).all(dim=1)
     if not inside.all():
         points, sample = points[inside], sample[inside]
@@ -41,7 +44,7 @@ def make_pillar_batch(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillar
 
 
 def keep_first_per_cell(cells: Tensor, count: int) -> Tensor:
-    """Ascending indices (M,) of the first `count` points of each cell, in the cloud's order."""
+    """Return the indices (M,), ascending, of the first `count` points of each cell."""
     ordered, indices = torch.sort(cells, stable=True)
     _, sizes = torch.unique_consecutive(ordered, return_counts=True)
     starts = torch.repeat_interleave(torch.cumsum(sizes, 0) - sizes, sizes)

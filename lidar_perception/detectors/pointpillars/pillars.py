@@ -1,4 +1,4 @@
-"""Points to pillars, without padding, of one cloud on the CPU."""
+"""Assignment of the points of one cloud to pillars, without padding, on the CPU."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ from numba import njit
 
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 
-Array = TypeVar("Array")  # of NumPy or torch
+Array = TypeVar("Array")  # NumPy array or torch tensor
 
 
 class Pillars(NamedTuple, Generic[Array]):
-    """The N points of B clouds that lie in the range, each with its pillar.
+    """The N points of B clouds in the range of the network, with their pillars. N may be 0.
 
-    points (N, 4 or 5) float32 [x y z intensity (id)], offsets (N, 5 or 6) float32
-    [x_c y_c z_c x_p y_p (z_p)], metres: from the mean of the pillar's points and from its middle
-    (Lang et al., Section 2.1).
-    cells (N,) int64 into B * H * W, row by row, rows along y; grid is (H, W). Clouds may be empty.
+    Attributes:
+        points: (N, 4 or 5) float32 [x y z intensity (id)], metres.
+        offsets: (N, 5 or 6) float32 [x_c y_c z_c x_p y_p (z_p)], metres, from the mean of the
+            pillar's points and from the centre of the pillar (Lang et al., Section 2.1).
+        cells: (N,) int64, indices into B * H * W cells, row by row, rows along y.
+        batch: B.
+        grid: (H, W).
     """
 
     points: Array
@@ -29,9 +32,12 @@ class Pillars(NamedTuple, Generic[Array]):
 
 
 def make_pillars(cloud: np.ndarray, config: NetworkConfig) -> Pillars[np.ndarray]:
-    """Return the pillars of a cloud (N, config.point_columns) float32. Points out of range are left
-    out, and those with NaN. Only max_points of a pillar stay, if that is set."""
-    points, offsets, cells = _of_one_cloud(
+    """Assign the points of a cloud (N, config.point_columns) float32 to pillars.
+
+    Points outside the range and points with NaN are dropped. If config.max_points is set, only
+    this many points of a pillar are kept.
+    """
+    points, offsets, cells = _make_pillars(
         np.ascontiguousarray(cloud), np.array(config.low, np.float32),
         np.array(config.high, np.float32), np.float32(config.cell), *config.grid,
         config.max_points, config.offset_columns)
@@ -39,8 +45,8 @@ def make_pillars(cloud: np.ndarray, config: NetworkConfig) -> Pillars[np.ndarray
 
 
 @njit(cache=True, nogil=True)
-def _of_one_cloud(cloud, low, high, cell, height, width, most, columns):
-    """points, offsets and cells of Pillars, with the same roundings as in torch."""
+def _make_pillars(cloud, low, high, cell, height, width, max_points, columns):
+    """Return points, offsets and cells of Pillars, rounded exactly as in torch."""
     points = np.empty_like(cloud)
     offsets = np.empty((len(cloud), columns), np.float32)
     cells = np.empty(len(cloud), np.int64)
@@ -59,7 +65,7 @@ def _of_one_cloud(cloud, low, high, cell, height, width, most, columns):
         column = min(int((point[0] - low[0]) / cell), width - 1)
         row = min(int((point[1] - low[1]) / cell), height - 1)
         own = row * width + column
-        if most and sums[own, 3] >= most:
+        if max_points and sums[own, 3] >= max_points:
             continue
         points[count] = point
         cells[count] = own

@@ -1,4 +1,4 @@
-"""The output of a PointPillars network, and what an engine that computes it looks like."""
+"""Output of a PointPillars network, and the interface of networks."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from lidar_perception.detectors.pointpillars.pillars import Pillars
 class Prediction(NamedTuple):
     """The output of a network for one cloud.
 
-    logits: (M, K) float32 of the anchors that were evaluated.
-    boxes_at: Returns codes (N, 7) and directions (N, 2), float32, at rows (N,) of logits.
-    anchors: (M,) int64, the anchors of these rows; None where they are all anchors in order.
+    Attributes:
+        logits: (M, K) float32 of the evaluated anchors.
+        boxes_at: boxes_at(rows (N,)) returns codes (N, 7) and directions (N, 2), float32, for rows
+            of logits.
+        anchors: (M,) int64, the anchor of each row; None: all anchors in order.
     """
 
     logits: np.ndarray
@@ -26,7 +28,7 @@ class Prediction(NamedTuple):
 class Network(Protocol):
     """A network that a PointPillarsProposer can run."""
 
-    has_fixed_range: bool  # it sees only the range that it was made for
+    has_fixed_range: bool  # the network cannot be used for another range
 
     def to(self, device: str) -> None:
         """Move to another device if the network can."""
@@ -35,5 +37,5 @@ class Network(Protocol):
         """Return the outputs for one cloud.
 
         Args:
-            maps: (1, 3, H, W) uint8, the map of the clusters; None if the network reads none.
+            maps: (1, 3, H, W) uint8 cluster map; None if the network has no branch for it.
         """

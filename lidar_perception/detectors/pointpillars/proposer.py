@@ -25,19 +25,24 @@ from lidar_perception.detectors.params import NmsParams, ScoreParams
 from lidar_perception.detectors.pointpillars.anchors import make_anchors
 from lidar_perception.detectors.pointpillars.box_coder import decode
 from lidar_perception.detectors.pointpillars.config import HALF, RANGES, NetworkConfig
-from lidar_perception.detectors.pointpillars.expert import NetworkInput, network_input
+from lidar_perception.detectors.pointpillars.expert import NetworkInput, make_network_input
 from lidar_perception.detectors.pointpillars.pillars import make_pillars
 from lidar_perception.detectors.pointpillars.prediction import Network, Prediction
 from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.types import SENSOR_HEIGHT, Detections, InputError
 
-SHARED_M = 1.0  # behind the sensor; boxes with their centre there are taken from both passes
+SHARED_M = 1.0  # boxes with their centre up to this far behind the sensor come from both passes
 TIMED_STEPS = ("preprocess", "network", "postprocess")
 
 
 class Boxes(NamedTuple):
-    """Boxes (M, 7) of one pass before NMS, their best logits (M,), and labels (M,) int, indices
-    into the classes."""
+    """Boxes of one pass before NMS.
+
+    Attributes:
+        boxes: (M, 7).
+        logits: (M,), that of the best class.
+        labels: (M,) int, index of this class in `classes`.
+    """
 
     boxes: np.ndarray
     logits: np.ndarray
@@ -47,8 +52,8 @@ class Boxes(NamedTuple):
 class PointPillarsProposer(TrainedNetwork):
     """A PointPillars network of any version that proposes boxes in a NormalizedView.
 
-    A network runs once, over the range of its config. One that was trained ahead covers the range
-    around in two passes over HALF of it: the second pass sees the cloud rotated by 180 degrees
+    A network runs once, over the range of its config. A network trained for `ahead` covers
+    `around` in two passes over HALF; the second pass reads the cloud rotated by 180 degrees
     about z.
 
     Args:
@@ -69,13 +74,13 @@ class PointPillarsProposer(TrainedNetwork):
         if range == "auto" or (range == "around") == (self.config.low[0] < 0):
             return self
         if self.network.has_fixed_range:
-            raise InputError("an exported network has one fixed range; use the checkpoint to see "
-                             f"{range}")
+            raise InputError("an exported network has a fixed range; use the checkpoint for the "
+                             f"range {range}")
         try:
             config = replace(self.config, **RANGES[range])
             half = replace(self.config, **HALF) if range == "around" else None
         except ValueError as error:
-            raise InputError(f"this network cannot see {range}: {error}") from None
+            raise InputError(f"this network does not support the range {range}: {error}") from None
         other = PointPillarsProposer(self.network, replace(self.header, config=config),
                                      self.device, half)
         other.placement = self.placement
@@ -84,15 +89,16 @@ class PointPillarsProposer(TrainedNetwork):
     def propose(self, view: NormalizedView, ground: np.ndarray | None,
                 cluster_ids: np.ndarray | None, scores: ScoreParams, nms: NmsParams,
                 cpu_fallback: bool = True) -> DetectionResult:
-        """Return boxes for a view of M points, in the coordinates of the view.
+        """Propose boxes for a view of M points, in the coordinates of the view.
 
         Args:
-            ground: (M,) bool; not None if the version removes the ground.
-            cluster_ids: (M,) int, 0 and below = none; not None if the version reads clusters.
+            ground: (M,) bool; required if the version removes the ground.
+            cluster_ids: (M,) int, 0 and below for no cluster; required if the version reads
+                clusters.
             scores: thresholds of the calibrated scores.
 
         Returns:
-            Detections including the vehicle that carries the sensor, with the times of
+            Detections, which may include the vehicle that carries the sensor, and the timings of
             TIMED_STEPS.
         """
         begin = self.now()
@@ -100,7 +106,7 @@ class PointPillarsProposer(TrainedNetwork):
         problem = self._find_problem(view, inputs)
         if not inputs:
             return DetectionResult(Detections.none(), dict.fromkeys(TIMED_STEPS, 0.0),
-                         problem or self.placement.fallback)
+                                   problem or self.placement.fallback)
 
         def work() -> tuple[list[float], DetectionResult]:
             times, predictions = self._predict(inputs)
@@ -117,7 +123,7 @@ class PointPillarsProposer(TrainedNetwork):
                      cluster_ids: np.ndarray | None) -> dict[bool, NetworkInput]:
         """Return the inputs of the passes that have points, by whether the cloud is rotated."""
         if len(self.half_turns) == 1:
-            inputs = {False: network_input(view.frame, self.config, ground, cluster_ids)}
+            inputs = {False: make_network_input(view.frame, self.config, ground, cluster_ids)}
         else:
             frame, inputs = view.frame, {}
             if self.config.remove_ground and ground is not None:  # reads obstacles only
@@ -130,12 +136,12 @@ class PointPillarsProposer(TrainedNetwork):
                     self.pass_config.low, self.pass_config.high)
                 own_ground, own_ids = (column if column is None else column.take(indices)
                                        for column in (ground, cluster_ids))
-                inputs[half_turn] = network_input(part, self.pass_config, own_ground, own_ids)
+                inputs[half_turn] = make_network_input(part, self.pass_config, own_ground, own_ids)
         return {half_turn: given for half_turn, given in inputs.items() if len(given.points)}
 
     def _predict(self, inputs: dict[bool, NetworkInput]
                  ) -> tuple[list[float], dict[bool, Prediction]]:
-        """Return when the network began and ended, and its outputs."""
+        """Return the start and end times of the network, and its outputs."""
         arguments = []
         for given in inputs.values():
             maps = None if given.cluster_map is None else given.cluster_map[None]
@@ -157,8 +163,8 @@ class PointPillarsProposer(TrainedNetwork):
         if any(len(rows) > 1 and np.array_equal(rows[0], rows[-1]) and (rows == rows[0]).all()
                for rows in logits):
             boxes, best_logits, labels = boxes[:0], best_logits[:0], labels[:0]
-            problem = ("the network gives every place the same scores; the weights are broken, "
-                       "use others")
+            problem = ("the network returns the same scores everywhere; the weights are broken, "
+                       "use other weights")
         elif len(boxes) == 0 and logits:
             best, problem = self.best_scores(expit(np.concatenate(logits).max(axis=0)).tolist())
         detections = apply_nms(boxes, expit(best_logits), labels, self.classes, nms)
@@ -201,8 +207,8 @@ class PointPillarsProposer(TrainedNetwork):
         intensity = view.frame.intensity
         if intensity is not None and (
                 lost := len(view) - np.count_nonzero(np.isfinite(intensity))):
-            return (f"{lost} of {len(view)} points are not seen, as their intensity is not a "
-                    "number (NaN); use 0 where it is unknown")
+            return (f"{lost} of {len(view)} points are ignored because their intensity is NaN; use "
+                    "0 for unknown intensities")
         if not inputs:
             return ("every point in the network's range is ground; is the sensor mounted at "
                     "another height or angle? set ground.sensor_pose")

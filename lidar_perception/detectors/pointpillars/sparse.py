@@ -1,11 +1,11 @@
-"""A network without ground on a CPU, computed only where it differs from an empty street.
+"""Sparse inference of networks without ground on a CPU.
 
-Without ground about 2 % of the pillars hold points. Where the receptive field of a layer has
-neither a pillar with points nor a cell of the cluster map, its value is that of an empty cloud: one
-row of numbers, and near the border of the grid a few more. These are computed once. For each cloud
-the layers compute the other cells, and of these only the ones that the head reads: it is evaluated
-up to REACH cells from a point, as farther away nothing is detected. The result is that of torch
-within rounding.
+Without ground about 2 % of the pillars contain points. A layer whose receptive field contains
+neither points nor cells of the cluster map has the same value as for an empty cloud: one row of
+numbers, and a few more near the border of the grid. These rows are computed once. For each cloud,
+the layers compute only the other cells, and only those that the head needs: it is evaluated up to
+REACH cells from a point, because nothing is detected farther away. The result equals that of torch
+up to rounding.
 """
 
 from __future__ import annotations
@@ -16,7 +16,13 @@ from typing import NamedTuple
 import numpy as np
 
 from lidar_perception.detectors.layer_weights import LayerWeights, Weights
-from lidar_perception.detectors.matrix_kernel import BLOCK, LANES, packed, padded, padded_bias
+from lidar_perception.detectors.matrix_kernel import (
+    BLOCK,
+    LANES,
+    pack_weights,
+    pad_bias,
+    pad_channels,
+)
 from lidar_perception.detectors.parallel import run_in_parts
 from lidar_perception.detectors.pointpillars import sparse_kernels as kernels
 from lidar_perception.detectors.pointpillars.config import BINS, CODE, NORM_EPS, NetworkConfig
@@ -25,18 +31,23 @@ from lidar_perception.detectors.pointpillars.prediction import Prediction
 from lidar_perception.detectors.pointpillars.sparse_layers import (
     Grid,
     Layer,
-    dilated,
+    dilate,
     make_layers,
-    shrunk,
+    shrink,
 )
 
-REACH = 6                 # cells of the head around each point in which it is evaluated
-MIN_PER_PART = 1_000_000  # multiplications that are worth handing to another thread
+REACH = 6                 # the head is evaluated up to this many of its cells from a point
+MIN_PER_PART = 1_000_000  # multiplications per task of a thread
 
 
 class Map(NamedTuple):
-    """Values of H x W cells: numbers (H + 2, W + 2) int32 of rows (R, C) float32. Row 0 is zero;
-    the border of numbers, which is the padding of a convolution, points at it."""
+    """Feature map of H x W cells, in which many cells can share a row.
+
+    Attributes:
+        numbers: (H + 2, W + 2) int32, the row of each cell. The border, which is the padding of a
+            convolution, refers to row 0.
+        rows: (R, C) float32; row 0 is zero.
+    """
 
     numbers: np.ndarray
     rows: np.ndarray
@@ -47,8 +58,8 @@ class Map(NamedTuple):
         return self.rows[self.numbers[1 + cells // width, 1 + cells % width]]
 
 
-def unsupported(config: NetworkConfig) -> str | None:
-    """Return why SparseNetwork cannot run a network on this machine, None where it can."""
+def find_unsupported_part(config: NetworkConfig) -> str | None:
+    """Return why SparseNetwork cannot run a network on this machine; None if it can."""
     if not LANES:
         return "this processor has no AVX2"
     if not config.remove_ground:
@@ -61,14 +72,14 @@ def unsupported(config: NetworkConfig) -> str | None:
 
 
 class SparseNetwork:
-    """A network on the CPU, for which unsupported() returns None. Several threads may call it at
-    once.
+    """A network on the CPU, which can be called from several threads.
 
     Args:
-        tensors: name -> array, the state_dict of network.make_network(config).
+        config: a config for which find_unsupported_part returns None.
+        tensors: state_dict of network.make_network(config), by name.
 
     Raises:
-        Misfit: the tensors are those of another network.
+        Misfit: the tensors belong to another network.
     """
 
     has_fixed_range = False
@@ -91,13 +102,13 @@ class SparseNetwork:
         scales[:2], scales[4 + offsets:] = config.xy_scale, config.id_scale
         order = [*range(4), *range(4 + offsets, points + offsets), *range(4, 4 + offsets)]
         scaled = (linear * scales)[:, order]  # points, then offsets
-        self.pillar_weights = packed(scaled[:, :, None])
-        self.pillar_bias = padded_bias(bias, len(self.pillar_weights) * BLOCK)
-        self.pillar_columns = padded(config.pillar_channels)
+        self.pillar_weights = pack_weights(scaled[:, :, None])
+        self.pillar_bias = pad_bias(bias, len(self.pillar_weights) * BLOCK)
+        self.pillar_columns = pad_channels(config.pillar_channels)
         self._empty: dict[Grid, list[Map]] = {}
 
     def to(self, device: str) -> None:
-        """Stay on the CPU."""
+        """Do nothing: the network stays on the CPU."""
 
     def __call__(self, pillars: Pillars[np.ndarray], maps: np.ndarray | None) -> Prediction:
         """Predict at the anchors of all cells up to REACH from a point."""
@@ -155,9 +166,9 @@ class SparseNetwork:
             masks[-1] = np.ones_like(masks[-1])
         else:
             scale = len(occupied[0]) // len(masks[-1])
-            masks[-1] = dilated(shrunk(occupied[0], scale), reach)
-        # The layers before the blocks compute a few cells only, fewer than it takes to find out
-        # which of them are needed.
+            masks[-1] = dilate(shrink(occupied[0], scale), reach)
+        # The layers before the blocks have few cells; selecting among them would cost more than
+        # computing all.
         needed = [None if i < self.first_block else np.zeros_like(mask)
                   for i, mask in enumerate(masks)]
         needed[-1] = masks[-1]
@@ -179,8 +190,8 @@ class SparseNetwork:
     def _empty_maps(self, grid: Grid) -> list[Map]:
         """Return the maps of all layers for an empty cloud.
 
-        Values depend on the distance to the border alone, so the layers are run on a grid that is
-        just large enough to have every distance that matters.
+        Values depend only on the distance to the border, so the layers run on the smallest grid
+        that has all relevant distances.
         """
         if grid not in self._empty:
             count = 2 if self.has_map else 1
@@ -197,7 +208,7 @@ class SparseNetwork:
             for layer in self.layers:
                 small_grids.append(layer.grid(small_grids))
             inputs = [Map(_blank(small), np.zeros((1, width), np.float32))
-                      for width in (self.pillar_columns, padded(3))[:count]]
+                      for width in (self.pillar_columns, pad_channels(3))[:count]]
             maps = self._run(inputs, [np.ones(g, bool) for g in small_grids[count:]],
                              [Map(_blank(g), np.zeros((1, len(layer.bias)), np.float32))
                               for g, layer in zip(small_grids[count:], self.layers)])
@@ -216,21 +227,21 @@ def _outputs_at(layer: Weights, per_cell: int, numbers: np.ndarray, rows: np.nda
 
 
 def _blank(grid: Grid) -> np.ndarray:
-    """An index that points at row 0 everywhere."""
+    """Return an index in which all cells refer to row 0."""
     return np.zeros((grid[0] + 2, grid[1] + 2), np.int32)
 
 
 def _cluster_map(maps: np.ndarray) -> Map:
-    """The Map of maps (3, H, W) uint8."""
+    """Convert cluster maps (3, H, W) uint8 to a Map."""
     occupied = (maps[0] | maps[1] | maps[2]) > 0
     cells, index = kernels.number_cells(occupied, _blank(occupied.shape), 1)
-    rows = np.zeros((1 + len(cells), padded(3)), np.float32)
+    rows = np.zeros((1 + len(cells), pad_channels(3)), np.float32)
     rows[1:, :3] = maps.reshape(3, -1)[:, cells].T
     return Map(index, rows)
 
 
 def _computed(layer: Layer, maps: list[Map], chosen: np.ndarray, background: Map) -> Map:
-    """The map of a layer, computed in the cells chosen (H, W) bool."""
+    """Return the map of a layer, computed in the cells `chosen` (H, W) bool."""
     first = len(background.rows)
     cells, index = kernels.number_cells(chosen, background.numbers, first)
     rows = np.empty((first + len(cells), len(layer.bias)), np.float32)
@@ -254,7 +265,7 @@ def _computed(layer: Layer, maps: list[Map], chosen: np.ndarray, background: Map
 
 
 def _background(of: Map, margin: int, grid: Grid) -> Map:
-    """The map of an empty cloud on a grid, from the one on a smaller grid."""
+    """Return the map of an empty cloud on a grid, made from that on a smaller grid."""
     kept, places = zip(*(_along(size, small - 2, margin)
                          for size, small in zip(grid, of.numbers.shape)))
     rows = of.rows[of.numbers[1:-1, 1:-1][np.ix_(*kept)]].reshape(-1, of.rows.shape[1])
@@ -264,8 +275,8 @@ def _background(of: Map, margin: int, grid: Grid) -> Map:
 
 
 def _along(size: int, small: int, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """Along one axis: which of `small` cells differ, and which of these each of `size` cells
-    equals."""
+    """Return, for one axis, which of `small` cells to keep, and which of these has the value of
+    each of `size` cells."""
     if small <= 2 * margin:
         return np.arange(size), np.arange(size)
     kept = np.r_[:margin + 1, small - margin:small]

@@ -1,7 +1,7 @@
 """Compiled kernels of the sparse network: convolutions and sums at chosen cells of a map.
 
-A map of H x W cells is an index (H + 2, W + 2) int32 into rows (R, C) float32; the border of the
-index points at a row of zeros, which is the padding of a convolution. Many cells can share a row.
+A map of H x W cells is an index (H + 2, W + 2) int32 into rows (R, C) float32. The border of the
+index refers to a row of zeros, the padding of a convolution. Many cells can share a row.
 """
 
 from __future__ import annotations
@@ -11,18 +11,23 @@ from numba import njit
 
 from lidar_perception.detectors.matrix_kernel import BLOCK, ROWS, multiply, multiply_tile
 
-BATCH = 32    # tiles whose addresses are looked up at once
-POINTS = 192  # points that go through a layer at once
+BATCH = 32    # tiles per table of addresses
+POINTS = 192  # points per call of multiply
 
 
 @njit(cache=True, nogil=True)
 def convolve(index, rows, cells, width, stride, weights, bias, sums, floor, first, last):
-    """Write a convolution of a map plus bias (C,) to sums (K, C) of the cells first .. last of
-    cells (K,); with an empty bias add it to the sums.
+    """Write a convolution of a map plus bias to sums; with an empty bias, add it to the sums.
 
-    index, rows: of the map. cells: numbers in a map that is `width` wide and `stride` times as
-    coarse. weights (blocks, taps, channels, BLOCK) float32: 9 taps of a 3 x 3 or 1 of a 1 x 1
-    convolution. C is blocks x BLOCK. Sums below floor become floor.
+    Args:
+        index, rows: the map.
+        cells: (K,) numbers of cells in a map that is `width` wide and `stride` times coarser.
+        weights: (blocks, taps, channels, BLOCK) float32, 9 taps for a 3 x 3 or 1 for a 1 x 1
+            convolution.
+        bias: (C,) float32 with C = blocks x BLOCK, or empty.
+        sums: (K, C) float32, the output.
+        floor: lower limit of the sums.
+        first, last: range of `cells` to compute.
     """
     blocks, taps, channels, _ = weights.shape
     row_bytes, sum_bytes = 4 * rows.shape[1], 4 * sums.shape[1]
@@ -59,9 +64,15 @@ def convolve(index, rows, cells, width, stride, weights, bias, sums, floor, firs
 
 @njit(cache=True, nogil=True)
 def upsample(index, rows, cells, width, scale, bias, sums, first, last):
-    """Write a map, enlarged `scale` times bilinearly, plus bias (C,) to sums (K, C) of the cells
-    first .. last of cells (K,), numbers in the larger map, `width` wide. As torch with
-    align_corners False."""
+    """Write a bilinearly upsampled map plus bias to sums, as torch with align_corners=False.
+
+    Args:
+        index, rows: the map.
+        cells: (K,) numbers of cells in the upsampled map, which is `width` wide.
+        bias: (C,) float32.
+        sums: (K, C) float32, the output.
+        first, last: range of `cells` to compute.
+    """
     height, across = index.shape[0] - 2, index.shape[1] - 2
     for i in range(first, last):
         row, column = divmod(np.int64(cells[i]), width)
@@ -80,8 +91,12 @@ def upsample(index, rows, cells, width, scale, bias, sums, first, last):
 
 @njit(cache=True, nogil=True)
 def number_cells(chosen, template, start):
-    """cells (K,) int32 that are chosen (H, W) bool, and the template (H + 2, W + 2) int32 of an
-    index in which they have the rows start, start + 1 .."""
+    """Assign the rows start, start + 1, ... to the cells that are True in chosen (H, W).
+
+    Returns:
+        Numbers (K,) int32 of these cells, and a copy of the index `template` (H + 2, W + 2) int32
+        with their rows.
+    """
     height, width = chosen.shape
     cells, index = np.empty(height * width, np.int32), template.copy()
     count = 0
@@ -96,9 +111,14 @@ def number_cells(chosen, template, start):
 
 @njit(cache=True, nogil=True)
 def pillar_rows(points, offsets, cells, index, weights, bias, rows):
-    """Raise the row of each pillar in rows (R, C) to the greatest values of its points: a layer
-    with ReLU, weights and bias as in multiply, of points (N, P) beside offsets (N, O); cells (N,)
-    int64."""
+    """Apply a linear layer with ReLU to each point and write the maximum per pillar to rows.
+
+    Args:
+        points, offsets: (N, P) and (N, O) float32, concatenated as the input of the layer.
+        cells: (N,) int64 cell of each point.
+        index, rows: the map; rows (R, C) start at 0 and are raised to the maximum.
+        weights, bias: as in multiply.
+    """
     width, read = index.shape[1] - 2, points.shape[1]
     inputs = np.zeros((POINTS, weights.shape[2]), np.float32)
     for first in range(0, len(points), POINTS):

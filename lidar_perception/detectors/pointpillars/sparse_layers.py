@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidar_perception.detectors.layer_weights import LayerWeights
-from lidar_perception.detectors.matrix_kernel import BLOCK, packed, padded_bias
+from lidar_perception.detectors.matrix_kernel import BLOCK, pack_weights, pad_bias
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 
 Grid = tuple[int, int]
@@ -21,13 +21,15 @@ Grid = tuple[int, int]
 
 @dataclass(frozen=True)
 class Layer:
-    """A convolution of the maps number `sources`, side by side, and map number `coarse` enlarged
-    `scale` times, added.
+    """A convolution of concatenated maps, optionally plus an upsampled coarser map.
 
-    weights: For each source, (blocks, taps, channels, BLOCK) float32 as in kernels.convolve; 9 taps
-        of a 3 x 3 or 1 of a 1 x 1 convolution.
-    bias: (C,) float32.
-    floor: A sum below it becomes floor.
+    Attributes:
+        sources: numbers of the concatenated maps.
+        weights: for each source, (blocks, taps, channels, BLOCK) float32 as in kernels.convolve; 9
+            taps for a 3 x 3 or 1 for a 1 x 1 convolution.
+        bias: (C,) float32.
+        floor: lower limit of the result; 0 for ReLU.
+        coarse: number of the map that is upsampled by `scale` and added; None: no such map.
     """
 
     sources: tuple[int, ...]
@@ -40,45 +42,44 @@ class Layer:
 
     @property
     def window(self) -> int:
-        """Number of cells that the convolution reads beyond the one in the middle."""
+        """Number of cells that the convolution reads on each side of the central one."""
         return 1 if self.weights[0].shape[1] == 9 else 0
 
     def grid(self, grids: Sequence[Grid]) -> Grid:
-        """Return (H, W) of its map, from those of the maps before it."""
+        """Return the size (H, W) of its map, given the sizes of earlier maps."""
         height, width = grids[self.sources[0]]
         return height // self.stride, width // self.stride
 
     def reached(self, occupied: Sequence[np.ndarray]) -> np.ndarray:
-        """Return (H, W) bool, True where its value depends on an occupied cell of the maps before
-        it."""
+        """Return (H, W) bool, True where its value depends on an occupied cell of earlier maps."""
         read = np.logical_or.reduce([occupied[source] for source in self.sources])
-        mask = dilated(read, self.window)[::self.stride, ::self.stride]
+        mask = dilate(read, self.window)[::self.stride, ::self.stride]
         if self.coarse is None:
             return mask
-        return mask | dilated(enlarged(occupied[self.coarse], self.scale), (self.scale + 1) // 2)
+        return mask | dilate(enlarge(occupied[self.coarse], self.scale), (self.scale + 1) // 2)
 
     def require(self, needed: np.ndarray, masks: Sequence[np.ndarray | None]) -> None:
-        """Set the cells from which its cells needed (H, W) are computed, in the masks of the maps
-        before it. None: a map of which everything is computed."""
+        """Mark, in the masks of earlier maps, the cells that its cells `needed` (H, W) depend on. A
+        mask is None if its map is computed completely."""
         for source in self.sources:
             if (mask := masks[source]) is not None:
                 read = np.zeros_like(mask)
                 read[::self.stride, ::self.stride] = needed
-                mask |= dilated(read, self.window)
+                mask |= dilate(read, self.window)
         if self.coarse is not None and (mask := masks[self.coarse]) is not None:
-            mask |= dilated(shrunk(needed, self.scale), 1)
+            mask |= dilate(shrink(needed, self.scale), 1)
 
     def margin(self, margins: Sequence[int]) -> int:
-        """Return the number of cells along each border in which its map of an empty cloud may
-        differ from the value inside; margins: those of the maps before it."""
+        """Return the width of the border, in cells, in which its map of an empty cloud may differ
+        from the inside, given the margins of earlier maps."""
         own = max(-(-margins[source] // self.stride) for source in self.sources) + self.window
         if self.coarse is None:
             return own
         return max(own, (margins[self.coarse] + 1) * self.scale)
 
 
-def dilated(mask: np.ndarray, cells: int) -> np.ndarray:
-    """Return (H, W) bool, True within `cells` of a True of mask (H, W) along both axes."""
+def dilate(mask: np.ndarray, cells: int) -> np.ndarray:
+    """Return the mask (H, W) dilate by `cells` along both axes."""
     for _ in range(cells):
         rows = mask.copy()
         rows[1:] |= mask[:-1]
@@ -89,21 +90,24 @@ def dilated(mask: np.ndarray, cells: int) -> np.ndarray:
     return mask
 
 
-def enlarged(mask: np.ndarray, scale: int) -> np.ndarray:
+def enlarge(mask: np.ndarray, scale: int) -> np.ndarray:
     """Return mask (H, W) with each cell repeated as scale x scale cells."""
     return mask.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
-def shrunk(mask: np.ndarray, scale: int) -> np.ndarray:
-    """Return, for each scale x scale cells of mask (H, W), True if any of them is."""
+def shrink(mask: np.ndarray, scale: int) -> np.ndarray:
+    """Return the mask (H, W) reduced by `scale`: True if any of scale x scale cells is."""
     rows = np.logical_or.reduce([mask[i::scale] for i in range(scale)])
     return np.logical_or.reduce([rows[:, i::scale] for i in range(scale)])
 
 
 def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
-    """Return the layers of a network with an FPN neck that adds; the last gives the scores of the
-    head, the one before it what the head reads. Map 0 is of the pillars, map 1 of the clusters if
-    the network has that branch, and then comes the map of each layer."""
+    """Return the layers of a network with an FPN neck that adds.
+
+    The last layer computes the scores of the head, the one before it the input of the head. Map 0
+    contains the pillars, map 1 the clusters if the network has that branch; then follows one map
+    per layer.
+    """
     layers: list[Layer] = []
     widths = [config.pillar_channels, 3][:2 if config.pseudo_map else 1]  # of each map
 
@@ -113,8 +117,8 @@ def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
         layer, norm = (f"{name}.0", f"{name}.1") if normed else (name, None)
         weight, bias = tensors.take(layer, (out, sum(read), kernel, kernel), norm)
         parts = np.split(weight.reshape(out, sum(read), -1), np.cumsum(read)[:-1], axis=1)
-        weights = tuple(map(packed, parts))
-        layers.append(Layer(tuple(sources), weights, padded_bias(bias, len(weights[0]) * BLOCK),
+        weights = tuple(map(pack_weights, parts))
+        layers.append(Layer(tuple(sources), weights, pad_bias(bias, len(weights[0]) * BLOCK),
                             stride, 0.0 if normed else -math.inf, coarse, scale))
         widths.append(out)
         return len(widths) - 1

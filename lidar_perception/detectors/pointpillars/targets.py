@@ -1,4 +1,4 @@
-"""Which anchor is to find which object (Lang et al., Section 4.1; SECOND's matching)."""
+"""Assignment of labelled objects to anchors (Lang et al., Section 4.1; matching as in SECOND)."""
 
 from __future__ import annotations
 
@@ -16,8 +16,13 @@ BACKGROUND, IGNORED = -1, -2
 
 
 class Targets(NamedTuple):
-    """What B clouds shall give: labels (B, A) int64, a class of the config, BACKGROUND or IGNORED;
-    codes (B, A, 7) and bins (B, A) of encode(), 0 where the label is no class."""
+    """Target outputs of the network for B clouds.
+
+    Attributes:
+        labels: (B, A) int64, index into config.classes, BACKGROUND or IGNORED.
+        codes: (B, A, 7), see encode; 0 if the label is not a class.
+        bins: (B, A) int64, see encode; 0 if the label is not a class.
+    """
 
     labels: Tensor
     codes: Tensor
@@ -25,8 +30,12 @@ class Targets(NamedTuple):
 
 
 class SparseTargets(NamedTuple):
-    """Targets of one cloud at the anchors that are not background, which are few: anchors (K,)
-    int64; labels (K,), codes (K, 7) and bins (K,) as in Targets."""
+    """Targets of one cloud at the few anchors that are not background.
+
+    Attributes:
+        anchors: (K,) int64 indices.
+        labels, codes, bins: (K,), (K, 7) and (K,), see Targets.
+    """
 
     anchors: np.ndarray
     labels: np.ndarray
@@ -35,8 +44,16 @@ class SparseTargets(NamedTuple):
 
 
 def encode(boxes: Tensor, anchors: Tensor, offset: float) -> tuple[Tensor, Tensor]:
-    """Return codes (N, 7) float32 and bins (N,) int64, 0 or 1, of boxes (N, 7) [x y z l w h yaw]
-    relative to anchors (N, 7): the inverse of box_coder.decode. l w h must be above 0."""
+    """Encode boxes relative to anchors, the inverse of box_coder.decode.
+
+    Args:
+        boxes: (N, 7) [x y z l w h yaw]; l w h must be above 0.
+        anchors: (N, 7).
+        offset: start of the bins, radians.
+
+    Returns:
+        Codes (N, 7) float32 and bins (N,) int64, 0 or 1.
+    """
     diagonal = torch.hypot(anchors[:, 3], anchors[:, 4])
     codes = torch.stack([
         (boxes[:, 0] - anchors[:, 0]) / diagonal,
@@ -48,18 +65,23 @@ def encode(boxes: Tensor, anchors: Tensor, offset: float) -> tuple[Tensor, Tenso
 
 
 def direction(yaw: Tensor, offset: float) -> Tensor:
-    """Return 0 for yaw in [offset, offset + pi), 1 for the other half of the circle; int64."""
+    """Return int64 bins: 0 for yaw in [offset, offset + pi), 1 for the other half of the circle."""
     turned = torch.remainder(yaw - offset, 2 * math.pi)
     return (turned >= math.pi).long()
 
 
 def assign(anchors: Tensor, config: NetworkConfig, boxes: Tensor, labels: Tensor) -> Targets:
-    """Targets (B = 1) of one cloud with boxes (M, 7) and labels (M,) int64 into config.classes.
+    """Return the targets (B = 1) of one cloud.
 
-    anchors (A, 7) of make_anchors. Each class is matched by itself: an anchor whose best overlap
-    is at least `matched` takes that object, one below `unmatched` is background, between them
-    neither; besides, every object takes the anchors that overlap it most. Overlaps are seen from
-    above, of boxes turned to the nearer axis. Objects without size are left out.
+    Each class is matched separately. An anchor is positive if its best IoU is at least `matched`,
+    background if it is below `unmatched`, and ignored otherwise. The anchors with the highest IoU
+    for an object are always positive. IoU is computed in the bird's-eye view with boxes rotated to
+    the nearest axis. Objects without a size are skipped.
+
+    Args:
+        anchors: (A, 7) from make_anchors.
+        boxes: (M, 7) labelled objects.
+        labels: (M,) int64, indices into config.classes.
     """
     out_labels = labels.new_full((len(anchors),), BACKGROUND)
     codes = anchors.new_zeros(len(anchors), 7)
@@ -67,7 +89,7 @@ def assign(anchors: Tensor, config: NetworkConfig, boxes: Tensor, labels: Tensor
     usable = (boxes[:, 3:6] > 0).all(dim=1) & torch.isfinite(boxes).all(dim=1)
     for index, spec in enumerate(config.anchors):
         objects = boxes[usable & (labels == index)].to(anchors.dtype)
-        mine = anchors_near(anchors, config, objects, index)
+        mine = find_near_anchors(anchors, config, objects, index)
         if len(mine) == 0:
             continue
         overlap = nearest_axis_iou(anchors[mine], objects)  # (A', M')
@@ -83,9 +105,9 @@ def assign(anchors: Tensor, config: NetworkConfig, boxes: Tensor, labels: Tensor
     return Targets(out_labels[None], codes[None], bins[None])
 
 
-def anchors_near(anchors: Tensor, config: NetworkConfig, boxes: Tensor, index: int) -> Tensor:
-    """Indices (A',) int64, rising, of the anchors of class `index` that may overlap one of boxes
-    (M, 7); all others overlap none. Most of a street is empty, so this saves most of the work."""
+def find_near_anchors(anchors: Tensor, config: NetworkConfig, boxes: Tensor, index: int) -> Tensor:
+    """Return the indices (A',) int64, ascending, of the anchors of class `index` that may overlap
+    one of the boxes (M, 7). Most of a street is empty, so this saves most of the work."""
     per_cell = len(config.anchors) * len(config.yaws)
     cells = anchors.view(*config.head_grid, per_cell, 7)
     reach = (boxes[:, 3:5].amax(dim=1) + max(config.anchors[index].size[:2])) / 2
@@ -97,39 +119,39 @@ def anchors_near(anchors: Tensor, config: NetworkConfig, boxes: Tensor, index: i
 
 
 def sparse(targets: Targets) -> SparseTargets:
-    """The targets of one cloud (B = 1), on the CPU, without the background."""
+    """Convert the targets of one cloud (B = 1), on the CPU, to SparseTargets."""
     labels = targets.labels[0]
     anchors = torch.nonzero(labels != BACKGROUND)[:, 0]
     return SparseTargets(anchors.numpy(), *(part[0][anchors].numpy() for part in targets))
 
 
 def dense(clouds: Sequence[SparseTargets], anchors: int, device: torch.device) -> Targets:
-    """The targets of B clouds that have so many anchors each, on a device."""
-    where = np.concatenate([cloud.anchors + i * anchors for i, cloud in enumerate(clouds)])
-    places = torch.from_numpy(where).to(device)
+    """Convert the SparseTargets of B clouds with `anchors` anchors each to Targets on a device."""
+    indices = torch.from_numpy(np.concatenate(
+        [cloud.anchors + i * anchors for i, cloud in enumerate(clouds)])).to(device)
 
-    def spread(parts: Sequence[np.ndarray], elsewhere: int) -> Tensor:
+    def scatter(parts: Sequence[np.ndarray], default: int) -> Tensor:
         values = torch.from_numpy(np.concatenate(parts)).to(device)
         shape = (len(clouds) * anchors, *values.shape[1:])
-        out = torch.full(shape, elsewhere, dtype=values.dtype, device=device)
-        return out.index_copy_(0, places, values).view(len(clouds), anchors, *values.shape[1:])
+        out = torch.full(shape, default, dtype=values.dtype, device=device)
+        return out.index_copy_(0, indices, values).view(len(clouds), anchors, *values.shape[1:])
 
-    return Targets(spread([c.labels for c in clouds], BACKGROUND),
-                   spread([c.codes for c in clouds], 0), spread([c.bins for c in clouds], 0))
+    return Targets(scatter([c.labels for c in clouds], BACKGROUND),
+                   scatter([c.codes for c in clouds], 0), scatter([c.bins for c in clouds], 0))
 
 
 def nearest_axis_iou(boxes: Tensor, others: Tensor) -> Tensor:
-    """(N, M) IoU, seen from above, of boxes (N, 7) and others (M, 7), each turned to the nearer of
-    the two axes."""
-    (low, high), (other_low, other_high) = _upright(boxes), _upright(others)
+    """Return the bird's-eye-view IoU (N, M) of boxes (N, 7) and others (M, 7), each rotated to the
+    nearest axis."""
+    (low, high), (other_low, other_high) = _align(boxes), _align(others)
     shared = (torch.minimum(high[:, None], other_high) - torch.maximum(low[:, None], other_low))
     shared = shared.clamp_(min=0).prod(dim=2)
     area, other_area = (high - low).prod(dim=1), (other_high - other_low).prod(dim=1)
     return shared / (area[:, None] + other_area - shared)
 
 
-def _upright(boxes: Tensor) -> tuple[Tensor, Tensor]:
-    """low (N, 2) and high (N, 2) of boxes (N, 7) turned to the nearer axis."""
+def _align(boxes: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the corners low (N, 2) and high (N, 2) of boxes (N, 7) rotated to the nearest axis."""
     folded = torch.remainder(boxes[:, 6] + math.pi / 2, math.pi) - math.pi / 2
     across = (folded.abs() > math.pi / 4)[:, None]
     half = torch.where(across, boxes[:, [4, 3]], boxes[:, [3, 4]]) / 2

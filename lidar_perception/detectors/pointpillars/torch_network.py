@@ -6,11 +6,11 @@ import numpy as np
 import torch
 
 from lidar_perception.detectors.devices import CPU, choose_dtype, uses_16_bits
-from lidar_perception.detectors.layer_weights import arrays_of
-from lidar_perception.detectors.pointpillars.network import PointPillars, fused
+from lidar_perception.detectors.layer_weights import to_arrays
+from lidar_perception.detectors.pointpillars.network import PointPillars, fuse_norms
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 from lidar_perception.detectors.pointpillars.prediction import Prediction
-from lidar_perception.detectors.pointpillars.sparse import SparseNetwork, unsupported
+from lidar_perception.detectors.pointpillars.sparse import SparseNetwork, find_unsupported_part
 from lidar_perception.runs.threads import set_torch_threads
 from lidar_perception.types import InputError
 
@@ -20,8 +20,8 @@ class TorchNetwork:
 
     Args:
         amp: number format of the layers, see devices.choose_dtype.
-        engine: what runs the layers on the CPU: torch; sparse, see sparse.py; or auto, sparse if
-            it can.
+        engine: implementation on the CPU: torch; sparse, see sparse.py; or auto, sparse if
+            possible.
 
     Raises:
         InputError: the engine is sparse and cannot run this network.
@@ -33,7 +33,7 @@ class TorchNetwork:
                  engine: str = "torch"):
         set_torch_threads()
         self.sparse = _make_sparse(network, amp, engine)
-        self.network, self.amp, self.device = fused(network).to(device), amp, device
+        self.network, self.amp, self.device = fuse_norms(network).to(device), amp, device
 
     def to(self, device: str) -> None:
         self.network.to(device)
@@ -63,11 +63,11 @@ def _make_sparse(network: PointPillars, amp: str, engine: str) -> SparseNetwork 
     if engine == "torch":
         return None
     config = network.pillar_net.config
-    reason = unsupported(config)
+    reason = find_unsupported_part(config)
     if not reason and uses_16_bits(amp):
-        reason = "it works in float32, and amp asks for 16 bits"
+        reason = "it supports float32 only, and amp selects 16 bits"
     if not reason:
-        return SparseNetwork(config, arrays_of(network))
+        return SparseNetwork(config, to_arrays(network))
     if engine == "sparse":
         raise InputError(f"the sparse engine cannot run this network: {reason}; choose the engine "
                          "auto or torch")

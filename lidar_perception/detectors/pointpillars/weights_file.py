@@ -1,4 +1,4 @@
-"""Where the weights are, found without loading torch."""
+"""Path of the weights of PointPillars, without loading torch."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ WEIGHTS = Path(__file__).parent / "weights"
 
 
 def weights_file(params: PointPillarsParams) -> Path:
-    """The file that params name, or else the one that comes with the package for their version and
-    size. InputError if it is not there."""
+    """Return `params.weights`, by default the shipped file for the version and size in `params`.
+
+    Raises:
+        InputError: the file does not exist.
+    """
     if params.weights:
         return require_weights(params.weights, "pointpillars.weights")
     version = "v4" if params.version == "auto" else params.version
     size = "compact" if params.size == "auto" else params.size
     path = WEIGHTS / f"pointpillars_{version}_{size}.safetensors"
     if not path.is_file():
-        raise InputError(f"no weights for {version} {size} come with the package; name a "
-                         "checkpoint with pointpillars.weights")
+        raise InputError(f"the package has no weights for {version} {size}; set "
+                         "pointpillars.weights to a checkpoint")
     return path

@@ -15,7 +15,7 @@ from lidar_perception.classes import DONT_CARE, TABLE
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.open import default_params
-from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
+from lidar_perception.detectors.pointnet.clusters import Clusters, make_clusters
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams, PointNetParams
 from lidar_perception.detectors.pointnet.predict import Predictions
@@ -143,7 +143,7 @@ def measure_network(weights: Path, settings: Mapping[str, Any],
                 partial(find_unlabelled, truth, camera),
             )
         seen, ids = scan.take(indices), ids[indices]
-        made = clusters_of(seen, ids, ground=ground[indices])
+        made = make_clusters(seen, ids, ground=ground[indices])
         labels, _ = label_clusters(made, truth.boxes, truth.class_ids, config.classes)
         labels = mask_unlabelled(labels, made, hidden(made.points[:, :3]), background)
         points = label_points(seen.xyz, truth.boxes, truth.class_ids, config.classes)

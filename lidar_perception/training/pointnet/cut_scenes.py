@@ -16,7 +16,12 @@ import numpy as np
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.fused.params import FusedParams
-from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of, middles, points_of
+from lidar_perception.detectors.pointnet.clusters import (
+    Clusters,
+    compute_centroids,
+    crop_boxes,
+    make_clusters,
+)
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, load_detector
 from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
@@ -132,7 +137,7 @@ def cut_clusters(scene: TrainingScene, config: PointNetConfig, min_points: int,
     scene = raise_scene(scene, scene.height - SENSOR_HEIGHT)
     frame = PointCloud(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
     ground = segment_ground(frame, config.ground)
-    clusters = clusters_of(frame, cluster_obstacles(frame.xyz, ground, config.clustering, sensed),
+    clusters = make_clusters(frame, cluster_obstacles(frame.xyz, ground, config.clustering, sensed),
                            min_points, ground)
     labels, owners = label_clusters(clusters, scene.boxes, scene.class_ids, config.classes)
     unwanted = (owners >= 0) & ~np.append(scene.wanted, False)[owners]
@@ -152,9 +157,9 @@ def cut_clusters(scene: TrainingScene, config: PointNetConfig, min_points: int,
     cut_labels = np.append([config.classes.index(CLASSES[scene.class_ids[i]]) for i in wanted],
                            np.full(len(cut_boxes) - len(wanted), background)).astype(np.int64)
     obstacles = frame.take(np.flatnonzero(~ground))
-    loose = points_of(cut_boxes, obstacles, OBJECT_MARGIN_M)
+    loose = crop_boxes(cut_boxes, obstacles, OBJECT_MARGIN_M)
     kept = np.flatnonzero(loose.sizes >= min_points)
-    loose = loose.take(kept).on(frame.xyz.compress(ground, axis=0))
+    loose = loose.take(kept).with_ground(frame.xyz.compress(ground, axis=0))
     both = Clusters(np.concatenate([clusters.points, loose.points]),
                     np.concatenate([clusters.first, clusters.first[-1] + loose.first[1:]]),
                     np.concatenate([clusters.ids, np.full(len(loose), -1)]),
@@ -172,7 +177,7 @@ def make_decoys(background: Clusters, config: PointNetConfig) -> np.ndarray:
     rng = np.random.default_rng(len(background.points))
     chosen = rng.permutation(len(background))[:MAX_DECOYS]
     own = background.take(chosen)
-    centres = middles(own.points, own.first)
+    centres = compute_centroids(own.points, own.first)
     sizes = np.array(config.sizes)[rng.integers(len(config.sizes), size=len(own))]
     sizes = sizes * rng.uniform(0.9, 1.15, sizes.shape)
     return np.column_stack([centres + rng.normal(0, 0.2, centres.shape),

@@ -20,14 +20,14 @@ from lidar_perception.detectors.pointnet.calibration import calibrate, calibrati
 from lidar_perception.detectors.pointnet.clusters import (
     ClusterInput,
     Clusters,
-    middles,
-    network_input,
+    compute_centroids,
+    make_network_input,
 )
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.losses import cluster_loss
 from lidar_perception.detectors.pointnet.network import PointNet, make_pointnet
-from lidar_perception.detectors.pointnet.predict import found, predict
-from lidar_perception.detectors.pointnet.torch_network import TorchPointNet, outputs_of
+from lidar_perception.detectors.pointnet.predict import predict, select_detections
+from lidar_perception.detectors.pointnet.torch_network import TorchPointNet, run_network
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import show_progress
@@ -88,13 +88,13 @@ class ClusterPreparation:
         labels, boxes = scene.labels[chosen], scene.boxes[chosen].copy()
         clusters = scene.clusters.take(chosen)
         background = np.flatnonzero(labels == len(self.config.classes))
-        feet = np.column_stack([middles(clusters.points, clusters.first), clusters.floor])
+        feet = np.column_stack([compute_centroids(clusters.points, clusters.first), clusters.floor])
         for k in background:
             own = slice(clusters.first[k], clusters.first[k + 1])
             clusters.points[own], _ = vary_thing(clusters.points[own], feet[k], self.augment,
                                                  rng)
         clusters, boxes = augment_clusters(clusters, boxes, scene.loose[chosen], self.augment, rng)
-        inputs = network_input(clusters, self.config.points, int(rng.integers(1 << 30)))
+        inputs = make_network_input(clusters, self.config.points, int(rng.integers(1 << 30)))
         has_box = (labels >= 0) & (labels < len(self.config.classes))
         classes = np.where(has_box, labels, 0)
         targets = encode(boxes, classes, inputs.centres, inputs.azimuths, self.config)
@@ -236,13 +236,13 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
     sizes = np.concatenate([s.clusters.sizes for s in scenes])
     if len(labels):
         logits = torch.cat([
-            outputs_of(network, network_input(s.clusters, config.points)).logits.cpu()
+            run_network(network, make_network_input(s.clusters, config.points)).logits.cpu()
             for s in scenes if len(s.clusters)])
         calibrate(network, logits, torch.from_numpy(labels))
     report, predictions = DetectionReport(), []
     for scene in show_progress(scenes, "validating", len(scenes)):
         predictions.append(predict(TorchPointNet(network), scene.clusters))
-        boxes = found(predictions[-1], config, [MIN_SCORE] * len(config.classes))
+        boxes = select_detections(predictions[-1], config, [MIN_SCORE] * len(config.classes))
         boxes = restore_detections(boxes, SensorPoseParams(height=scene.height))
         report.update(FrameDetections(scene.name, scene.truth, boxes, scene.calibration))
     metrics, calibration = summarize_report(report, "bev", config.classes)

@@ -21,7 +21,7 @@ from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
-from lidar_perception.detectors.pointpillars.expert import network_input
+from lidar_perception.detectors.pointpillars.expert import make_network_input
 from lidar_perception.detectors.pointpillars.losses import detection_loss
 from lidar_perception.detectors.pointpillars.network import (
     PointPillars,
@@ -36,9 +36,9 @@ from lidar_perception.detectors.pointpillars.targets import (
     IGNORED,
     SparseTargets,
     Targets,
-    anchors_near,
     assign,
     dense,
+    find_near_anchors,
     nearest_axis_iou,
     sparse,
 )
@@ -143,7 +143,7 @@ class ScenePreparation:
         frame = PointCloud(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
         seen = NormalizedView.of(frame, SensorPoseParams(height=scene.height), self.config.low,
                                  self.config.high).frame
-        inputs = network_input(seen, self.config)
+        inputs = make_network_input(seen, self.config)
         if len(inputs.points) < 2:
             raise InputError("a scene has no point in the detection range")
         boxes, labels, counted = self._select_objects(raise_scene(scene, lift[2]), seen.xyz)
@@ -204,7 +204,7 @@ def _assign_targets(boxes: np.ndarray, labels: np.ndarray, counted: np.ndarray, 
     for index, spec in enumerate(config.anchors):
         for others, min_iou in ((all_boxes[~wanted & (classes == index)], spec.unmatched),
                                 (all_boxes[classes == DONT_CARE_LABEL], MIN_TOUCH_IOU)):
-            candidates = anchors_near(anchors, config, others, index)
+            candidates = find_near_anchors(anchors, config, others, index)
             if len(candidates):
                 ignored = (nearest_axis_iou(anchors[candidates], others).max(dim=1).values
                            >= min_iou)
