@@ -1,1 +1,1 @@
-"""Experiments on the package, run from a checkout; they are not part of the wheel."""
+"""Experiments on lidar_perception, run from a checkout. The wheel does not contain them."""

@@ -156,7 +156,7 @@ def made(streets, tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def crowds(tmp_path_factory) -> Path:
     """A KITTI folder of people."""
-    from reproduction_samples import COUNT
+    from experiment_samples import COUNT
     from samples import crowd_folder
     return crowd_folder(tmp_path_factory.mktemp("kitti"), COUNT)
 
@@ -165,7 +165,7 @@ def crowds(tmp_path_factory) -> Path:
 def whole(crowds, tmp_path_factory) -> Path:
     """The folder of a run of the paper's experiment on the crowds that nothing has stopped; beside
     it, what the command said."""
-    from reproduction_samples import command
+    from experiment_samples import command
     from samples import write
     out = tmp_path_factory.mktemp("whole") / "out"
     with pytest.MonkeyPatch.context() as patch:

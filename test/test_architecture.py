@@ -25,7 +25,7 @@ MAX_LINES = 400
 # From the ground up: a room imports only those before it, and itself.
 ROOMS = ("classes", "intensity", "types", "param_fields", "geometry", "camera", "groups", "robot",
          "runs", "wire", "ground", "data", "clustering", "candidates", "detectors", "tracking",
-         "rendering", "scoring", "simulation", "sensor_setup", "training", "reproduction", "labels",
+         "rendering", "scoring", "simulation", "sensor_setup", "training", "labels",
          "detecting", "params", "api", "nodes", "cli", "testing")
 # What the files of a room may import besides the rooms below and the standard library.
 NUMBERS = ["numpy", "scipy", "numba"]
@@ -39,7 +39,7 @@ STRANGERS = {
     "ground": [*NUMBERS, "pypatchworkpp"], "clustering": NUMBERS, "candidates": NUMBERS,
     "detectors": [*NUMBERS, "llvmlite", "torch", "safetensors", "onnx", "onnxruntime",
                   "onnxscript"],
-    "tracking": ["numpy", "scipy", "kiss_icp"],
+    "tracking": [*NUMBERS, "kiss_icp"],
     "rendering": ["numpy", "PIL", "matplotlib", "av", "msg_utils"],
     "sensor_setup": ["numpy", "scipy", "matplotlib", "msg_utils"],
     "labels": ["numpy", "msg_utils"], "params": [],
@@ -138,6 +138,12 @@ def test_the_core_imports_no_ros_no_nodes_and_no_command_line(name):
 @for_all(files_in("lidar_perception", "msg_utils"))
 def test_library_never_imports_the_studio(name):
     assert [m for m in imports(name) if within(m, ["lidar_studio"])] == []
+
+
+@for_all(SOURCES)
+def test_wheel_never_imports_repository_folders(name):
+    assert [m for m in imports(name)
+            if within(m, ["experiments", "benchmark", "scripts", "test"])] == []
 
 
 @for_all([name for name in SOURCES if not name.startswith("lidar_perception/nodes/")])
@@ -318,16 +324,16 @@ LIGHT = [
     ("lidar_perception.scoring.nuscenes.report", "torch matplotlib sklearn click rosbags"),
     ("lidar_perception.scoring.centres.report", "torch matplotlib sklearn click"),
     ("lidar_perception.scoring.kitti.report", "torch matplotlib sklearn click"),
-    ("lidar_perception.scoring.comparison.outcomes", "torch matplotlib sklearn click"),
-    ("lidar_perception.reproduction.stm_cpa", "torch matplotlib sklearn click jinja2 distributed"),
+    ("experiments.comparison.outcomes", "torch matplotlib sklearn click"),
+    ("experiments.stm_cpa.experiment", "torch matplotlib sklearn click jinja2 distributed"),
     ("lidar_perception.camera", "torch matplotlib sklearn"),
     ("lidar_perception.api", "torch matplotlib"),
 ], [
     ("lidar_perception", "numpy numba torch matplotlib scipy rosbags rich click"),
     ("lidar_perception.testing", "numpy numba torch matplotlib scipy rosbags click launch_testing"),
     ("lidar_perception.cli.main", "numba torch matplotlib scipy sklearn rosbags"),
-    ("lidar_perception.cli.compare", "numba torch matplotlib scipy sklearn"),
-    ("lidar_perception.cli.reproduce", "numba torch matplotlib scipy sklearn jinja2 distributed"),
+    ("experiments.comparison.command", "numba torch matplotlib scipy sklearn"),
+    ("experiments.framework.command", "numba torch matplotlib scipy sklearn jinja2 distributed"),
     ("lidar_perception.cli.train", "numba torch matplotlib scipy"),
     ("lidar_perception.cli.weights", "numba torch matplotlib scipy"),
 ], [

@@ -12,39 +12,49 @@ from lidar_perception import __version__
 from lidar_perception.cli.command import Group
 
 COMMANDS = {  # verb -> module.function, and its line in the overview
-    "demo": ("demo.demo", "Replay a drive through the ROS 2 nodes and score the result."),
-    "convert": ("convert.convert", "Turn recordings and labels into bags and other formats."),
-    "detect": ("detect.detect", "Run a detector on a recording and write its results."),
-    "evaluate": ("evaluate.group.evaluate", "Score the algorithms without ROS."),
-    "compare": ("compare.compare", "Run every detector on the same frames, side by side."),
-    "view": ("lidar_studio.cli.view.view", "Look at a recording and its results on a page in "
-                                         "the browser."),
-    "reproduce": ("reproduce.reproduce", "Reproduce every table of the STM-CPA paper."),
-    "setup": ("setup.setup", "Measure a sensor and its mounting from unlabelled clouds."),
+    "demo": ("lidar_perception.cli.demo.demo",
+             "Replay a drive through the ROS 2 nodes and score the result."),
+    "convert": ("lidar_perception.cli.convert.convert",
+                "Turn recordings and labels into bags and other formats."),
+    "detect": ("lidar_perception.cli.detect.detect",
+               "Run a detector on a recording and write its results."),
+    "evaluate": ("lidar_perception.cli.evaluate.group.evaluate",
+                 "Score the algorithms without ROS."),
+    "view": ("lidar_studio.cli.view.view",
+             "Look at a recording and its results on a page in the browser."),
+    "setup": ("lidar_perception.cli.setup.setup",
+              "Measure a sensor and its mounting from unlabelled clouds."),
     "label": ("lidar_studio.cli.label.label", "Label a drive on a page in the browser."),
-    "seed": ("seed.seed", "Make a template of a seed pedestrian."),
-    "simulate": ("simulate.simulate", "Write simulated, labelled scans as a bag or a data set."),
-    "train": ("train.train", "Train a detector on recordings or simulated streets."),
-    "import-weights": ("weights.import_weights", "Import PointPillars weights from other "
-                                                 "projects."),
-    "export": ("weights.export", "Export a network for another runtime."),
-    "info": ("info.info", "List what is in a bag or another recording."),
-    "run": ("run.run_node", "Start one ROS node."),
+    "seed": ("lidar_perception.cli.seed.seed", "Make a template of a seed pedestrian."),
+    "simulate": ("lidar_perception.cli.simulate.simulate",
+                 "Write simulated, labelled scans as a bag or a data set."),
+    "train": ("lidar_perception.cli.train.train",
+              "Train a detector on recordings or simulated streets."),
+    "import-weights": ("lidar_perception.cli.weights.import_weights",
+                       "Import PointPillars weights from other projects."),
+    "export": ("lidar_perception.cli.weights.export", "Export a network for another runtime."),
+    "info": ("lidar_perception.cli.info.info", "List what is in a bag or another recording."),
+    "run": ("lidar_perception.cli.run.run_node", "Start one ROS node."),
 }
 
 
 class LazyGroup(Group):
-    """A group that imports a command's module on first use."""
+    """A group that imports the module of a command on first use.
+
+    commands_by_name: verb -> module.function, and its line in the overview.
+    """
+
+    def __init__(self, *args: Any, commands_by_name: dict[str, tuple[str, str]], **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.commands_by_name = commands_by_name
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
+        return list(self.commands_by_name)
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        if name not in COMMANDS:
+        if name not in self.commands_by_name:
             return None
-        module, _, function = COMMANDS[name][0].rpartition(".")
-        if not module.startswith("lidar_studio."):
-            module = f"lidar_perception.cli.{module}"
+        module, _, function = self.commands_by_name[name][0].rpartition(".")
         return getattr(importlib.import_module(module), function)
 
     def invoke(self, ctx: click.Context) -> Any:
@@ -58,10 +68,12 @@ class LazyGroup(Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+            formatter.write_dl([(name, text)
+                                for name, (_, text) in self.commands_by_name.items()])
 
 
-@click.group(cls=LazyGroup, context_settings=dict(help_option_names=["-h", "--help"]))
+@click.group(cls=LazyGroup, commands_by_name=COMMANDS,
+             context_settings=dict(help_option_names=["-h", "--help"]))
 @click.version_option(__version__, prog_name="lidar-perception")
 def cli() -> None:
     """LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned detectors of
@@ -73,7 +85,7 @@ def cli() -> None:
       lidar-perception demo /data/kitti/tracking
       lidar-perception convert /data/kitti/object --out kitti.bag
       lidar-perception evaluate candidates /data/kitti/object --json scores.json
-      lidar-perception reproduce stm-cpa /data/kitti/object --out report
+      lidar-perception detect drive.bag --out results
       lidar-perception run fused_detector --ros-args -r '~/input/points:=/points'
 
     Exit codes: 0 done, 1 ran but something failed, 2 the command or its input cannot be used, 130
@@ -81,7 +93,8 @@ def cli() -> None:
     """
 
 
-def main() -> None:
+def run_cli(group: click.Group, name: str) -> None:
+    """Run a group of commands; bad input is one line on stderr and exit code 2."""
     from lidar_perception.runs.files import convert_os_errors
     from lidar_perception.runs.memory import keep_freed_memory
     from lidar_perception.runs.threads import use_passive_waiting
@@ -90,10 +103,14 @@ def main() -> None:
     keep_freed_memory()
     try:
         with convert_os_errors():
-            cli(prog_name="lidar-perception")
+            group(prog_name=name)
     except InputError as error:
         click.echo(f"Error: {error}", err=True)
         sys.exit(2)
+
+
+def main() -> None:
+    run_cli(cli, "lidar-perception")
 
 
 if __name__ == "__main__":

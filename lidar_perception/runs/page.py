@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import base64
+from pathlib import Path
 from typing import Any
 
 
-def render_page(template: str, **values: Any) -> str:
-    """Render a template of the package, such as "sensor_setup/report/report.html".
+def render_page(template: Path, **values: Any) -> str:
+    """Render the template in a file, which may extend page.html of this folder.
 
-    Templates extend runs/page.html. Values are escaped; a name without a value is an error.
+    Values are escaped; a name without a value is an error.
     """
     import jinja2
 
     return jinja2.Environment(
-        loader=jinja2.PackageLoader("lidar_perception", ""), autoescape=True,
-        undefined=jinja2.StrictUndefined).get_template(template).render(values)
+        loader=jinja2.FileSystemLoader([template.parent, Path(__file__).parent]), autoescape=True,
+        undefined=jinja2.StrictUndefined).get_template(template.name).render(values)
 
 
 def to_data_url(picture: bytes, kind: str = "png") -> str:

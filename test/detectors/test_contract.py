@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import CALIBRATION, crowd
 
+from experiments.comparison.contenders import open_contenders
 from lidar_perception.classes import CAR
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors import normalized_view
@@ -23,7 +24,6 @@ from lidar_perception.detectors.pointnet import weights_file as pointnet_weights
 from lidar_perception.detectors.pointpillars import weights_file as pointpillars_weights
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.params import SensorPoseParams
-from lidar_perception.scoring.comparison.contenders import contenders
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, InputError, PointCloud
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -49,8 +49,8 @@ def detectors(frame, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         for module in pointpillars_weights, pointnet_weights:
             patch.setattr(module, "WEIGHTS", folder / "none")
-        found, _ = contenders([folder / "a", folder / "b"], "cpu")
-    return {each.name: each.detector_of(frame) for each in found}
+        found, _ = open_contenders([folder / "a", folder / "b"], "cpu")
+    return {each.name: each.make_detector(frame) for each in found}
 
 
 def test_these_are_all(detectors):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from samples import scene
 
+from experiments.comparison.contenders import _make_name
 from lidar_perception.detectors import custom
 from lidar_perception.detectors.open import default_params, open_detector, resolve_weights
-from lidar_perception.scoring.comparison.contenders import _name
 from lidar_perception.types import Detections, InputError, RunError
 
 MODULE = """
@@ -124,5 +124,5 @@ def test_function_becomes_a_detector():
 
 def test_comparison_names_class_by_its_reference(module):
     detector = open_detector(f"{module}:Fixed")
-    assert _name(detector, ["fused"]) == f"{module}:Fixed"
-    assert _name(detector, [f"{module}:Fixed"]) == f"{module}:Fixed #2"
+    assert _make_name(detector, ["fused"]) == f"{module}:Fixed"
+    assert _make_name(detector, [f"{module}:Fixed"]) == f"{module}:Fixed #2"

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from rich.console import Console
 from samples import CALIBRATION, calibration_text, object_folder, scene, walker_label, write
 
-from experiments.realism import __main__ as command
+from experiments.realism import command
 from experiments.realism.compare import (
     MAX_SCANS,
     MIN_SAMPLES,
@@ -348,7 +348,7 @@ def test_the_command_compares(tmp_path, monkeypatch):
             name: content["curves"][name] for name in kinds.values()}})
     monkeypatch.setattr(command, "draw_realism", few_drawn)
     root, made = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "made"
-    result = CliRunner().invoke(command.main, [
+    result = CliRunner().invoke(command.realism, [
         str(root), "--frames", "1", "--json", str(made / "realism.json"), "--png",
         str(made / "realism.png")], catch_exceptions=False)
     assert result.exit_code == 0, result.output
@@ -362,7 +362,7 @@ def test_the_command_compares(tmp_path, monkeypatch):
 
 def test_the_sensor_that_is_asked_for_is_compared(tmp_path):
     root, found = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "realism.json"
-    result = CliRunner().invoke(command.main, [
+    result = CliRunner().invoke(command.realism, [
         str(root), "--frames", "1", "--json", str(found), "--sensor", "generic:4,-12,0,2,10"],
         catch_exceptions=False)
     assert result.exit_code == 0, result.output

@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import CALIBRATION, crowd
 
+from experiments.stm_cpa.frames import load_labelled_frame
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams, SeedParams
 from lidar_perception.data.frame import Frame, Recording
-from lidar_perception.reproduction.labelled import load_labelled
 from lidar_perception.scoring.centres.matching import (
     RANGE_NAMES,
     Score,
@@ -281,6 +281,6 @@ def test_labels_behind_the_camera_are_not_missed_in_its_view():
     counts = report.compute()["pedestrian_centres"]["of_all"]["all"]
     assert (counts["tp"], counts["fp"], counts["fn"]) == (len(people), 0, 0)
 
-    np.testing.assert_array_equal(load_labelled(around).pedestrians, people)
+    np.testing.assert_array_equal(load_labelled_frame(around).pedestrians, people)
     with pytest.raises(InputError, match="in the image"):
-        load_labelled(behind)
+        load_labelled_frame(behind)

@@ -11,11 +11,12 @@ from click.testing import CliRunner
 from lidar_perception.cli.main import cli, main
 
 
-def exit_of(monkeypatch, *arguments) -> int:
-    """The exit code of `lidar-perception ARGUMENTS`, run in this process."""
+def exit_of(monkeypatch, *arguments, run=main) -> int:
+    """The exit code of `lidar-perception ARGUMENTS`, or of another command line, in this process.
+    """
     monkeypatch.setattr(sys, "argv", ["lidar-perception", *map(str, arguments)])
     try:
-        main()
+        run()
     except SystemExit as stop:
         return stop.code or 0
     return 0

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import expit
 
+from experiments.comparison.contenders import open_contenders
 from lidar_perception.camera import Camera
 from lidar_perception.classes import CAR, DETECTED
 from lidar_perception.data.frame import Frame
@@ -36,7 +37,6 @@ from lidar_perception.detectors.pointnet.weights_file import weights_file as cla
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file as proposer_file
 from lidar_perception.param_fields import with_values
-from lidar_perception.scoring.comparison.contenders import contenders
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.training.fusion_curves import (
     MIN_SAMPLES,
@@ -208,7 +208,7 @@ def test_damaged_file_is_used_or_refused_in_one_line(tmp_path):
 
 
 def test_fusion_file_is_compared_as_separate_detector(others):
-    found = {each.name: each.source for each in contenders([others[0]], "cpu")[0]}
+    found = {each.name: each.source for each in open_contenders([others[0]], "cpu")[0]}
     assert found["fused #2"] == str(others[0]) and found["fused"] != found["fused #2"]
 
 

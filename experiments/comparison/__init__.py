@@ -1,0 +1,1 @@
+"""Comparison of all detectors on the same frames."""

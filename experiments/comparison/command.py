@@ -1,0 +1,92 @@
+"""The verb compare: every detector of the package on the same frames."""
+
+from __future__ import annotations
+
+import platform
+from functools import partial
+from pathlib import Path
+
+import click
+
+from lidar_perception.cli.command import Command
+from lidar_perception.cli.data import (
+    Walk,
+    a_path,
+    intervals_option,
+    no_labels,
+    out_file,
+    walk_options,
+)
+from lidar_perception.cli.options import (
+    Runs,
+    Settings,
+    candidates_run,
+    device_option,
+    range_option,
+    runs_of,
+    settings_options,
+)
+from lidar_perception.detectors.open import PARAMS
+from lidar_perception.runs.terminal import console, errors
+
+
+def _list_runs() -> list[Runs]:
+    """List the detectors that have parameters."""
+    return [candidates_run(), *map(runs_of, PARAMS)]
+
+
+@click.command(cls=Command)
+@walk_options()
+@a_path("--weights", "One more detector: weights of PointPillars or PointNet, or a class of your "
+        "own, module:Class; may be repeated.",
+        multiple=True)
+@out_file("--png", "Draw F1 and mean AP against time.")
+@intervals_option
+@range_option
+@device_option
+@settings_options(lambda given: _list_runs(), candidates=True)
+def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, range: str, device: str,
+            settings: Settings, intervals: int) -> None:
+    """Run all detectors on the same frames, in turns, and print scores and times side by side.
+
+    The detectors are STM-CPA (`paper` and `best`), PointPillars V0 to V4 in both sizes, PointNet
+    and fused (the default detector). The tables show average precision, F1 of pedestrians by
+    centre distance as in the STM-CPA paper, and ms per frame. Networks without weights are listed
+    as missing. With several --jobs the processes share the machine, and times are longer.
+
+    \b
+    Examples:
+      ./lidar compare /data/kitti/object --json compare.json --png compare.png
+      ./lidar compare /data/kitti/tracking --intervals 200
+      ./lidar compare training_data --weights v4.safetensors --limit 100
+    """
+    from experiments.comparison.contenders import open_contenders, open_contenders_alone
+    from experiments.comparison.outcomes import ComparisonReport, start_comparison
+    from experiments.comparison.report import draw_comparison, print_comparison
+    from lidar_perception.data.frame import BOXES
+    from lidar_perception.runs.machine import read_cpu_name
+    from lidar_perception.scoring.kitti.tables import CENTRE_F1
+
+    runs = _list_runs() if settings else []
+    values = {run.name: chosen for run, chosen in zip(runs, settings.values(*runs))}
+    recording = walk.opened(BOXES)
+    with errors.status("loading detectors"):
+        height = recording.frames[0].sensor_height
+        contenders, missing = open_contenders(weights, device, height, range, values)
+    open_ = (lambda: contenders) if walk.here else partial(
+        open_contenders_alone, weights, device, height, range, values)
+    report = ComparisonReport(contenders, intervals, recording.is_sequential)
+    walk.fill(report, recording, partial(start_comparison, open_), title="comparing")
+    if not report.first.frames:
+        raise no_labels(recording, report.skipped)
+    centres = report.first.pedestrians.compute()
+    content = {
+        "source": str(walk.data), "machine": read_cpu_name(), "device": device,
+        "python": platform.python_version(), **report.compute(),
+        "pedestrians": {key: centres[key] for key in ("frames", "ground_truth")},
+        "missing": [vars(detector) for detector in missing], "paper_f1": CENTRE_F1}
+    print_comparison(content, console)
+    walk.write(content)
+    if png is not None:
+        draw_comparison(png, content)
+        console.print(f"figure: {png}")

@@ -1,0 +1,1 @@
+"""Experiments over the frames of a recording: measuring, statistics, and the report."""

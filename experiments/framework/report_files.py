@@ -1,0 +1,24 @@
+"""Names of the files that a report writes into the folder of a run."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from pathlib import Path
+
+REPORT = "report.json"  # written before the tables and figures that it names
+PAGES = ("report.html", "report.md", REPORT)
+FOLDERS = {"tables": ".csv", "figures": ".png"}
+
+
+def list_report_files(folder: Path) -> list[Path]:
+    """List the files of the report in a folder.
+
+    Only tables and figures named in report.json are listed, so that other files are kept.
+    """
+    names = []
+    with suppress(OSError, ValueError, KeyError, TypeError):  # no report, or not ours
+        report = json.loads((folder / REPORT).read_text())
+        names = [f"{kind}/{Path(item['name']).name}{ending}" for section in report["sections"]
+                 for kind, ending in FOLDERS.items() for item in section[kind]]
+    return [folder / name for name in (*names, *PAGES)]

@@ -1,0 +1,67 @@
+"""Run of an experiment over the frames of a recording, in several processes or on a cluster."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from experiments.framework.experiment import Experiment
+from experiments.framework.report_files import list_report_files
+from lidar_perception import __version__
+from lidar_perception.candidates.warm_up import warm_up
+from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.runs.journal import open_journal
+from lidar_perception.runs.resuming import hash_names
+from lidar_perception.scoring.run import fill_journal
+
+
+def run_experiment(experiment: Experiment, recording: Recording, out: Path, *, jobs: int = 1,
+                   dask: str | None = None, force: bool = False,
+                   limit: int | None = None) -> list[dict[str, Any]]:
+    """Measure the first `limit` frames of a recording, or all, and return their records in order.
+
+    Every record is written to out/frames.jsonl as soon as it is measured, and a run that was
+    stopped resumes there. Apart from measured times, the records depend neither on jobs nor on
+    dask.
+
+    Args:
+        jobs, dask: See scoring.run.results.
+        force: Delete the records of another run in out.
+
+    Returns:
+        One record for each frame. A frame that cannot be measured has {"frame": name, "skipped":
+        reason}. Labels without a scan come last.
+
+    Raises:
+        InputError: out contains another run, or a process or the cluster fails.
+    """
+    names = [frame.name for frame in recording]
+    plan = {"experiment": experiment.name, "version": __version__,
+            "data": str(recording.path.resolve()), "frames": len(names),
+            "frame_names": hash_names(names),
+            "settings": experiment.settings}
+    with open_journal(out, plan, force=force, list_files=list_report_files) as journal, \
+            threadpool_limits(1):
+        start = functools.partial(_make_measure, experiment)
+        fill_journal(journal, recording, start, names[:limit],
+                     jobs=jobs, dask=dask, title=experiment.name)
+        journal.sort(names)
+        records = [json.loads(journal.lines[name]) for name in names[:limit]]
+    lost = recording.missing_scans if limit is None else ()
+    return records + [{"frame": name, "skipped": reason} for name, reason in lost]
+
+
+def _make_measure(experiment: Experiment, recording: Recording) -> Callable[[Frame], str]:
+    """Return a function that measures a frame and returns its record as JSON."""
+    warm_up()
+    number = {frame.name: i for i, frame in enumerate(recording)}
+
+    def measure(frame: Frame) -> str:
+        record = experiment.measure(recording.frames, number[frame.name])
+        return json.dumps({"frame": frame.name, **record}, allow_nan=False)
+    return measure

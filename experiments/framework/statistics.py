@@ -1,0 +1,109 @@
+"""Rates with intervals, by a bootstrap over frames (Efron, 1979; percentile method)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from experiments.framework.experiment import Cell, Line
+
+MAX_DRAWS = 4_000_000  # frames drawn at once; bounds the memory
+
+
+@dataclass(frozen=True)
+class BootstrapParams:
+    """Parameters of the intervals.
+
+    Attributes:
+        replicates: Number of times that as many frames as there are, are drawn with replacement.
+        level: Share of the replicates within the interval.
+    """
+
+    replicates: int = 2000
+    level: float = 0.95
+    seed: int = 0
+
+
+def bootstrap(counts: np.ndarray, compute: Callable[[np.ndarray], np.ndarray],
+              params: BootstrapParams = BootstrapParams()) -> np.ndarray:
+    """Return values computed from counts, with their intervals.
+
+    Args:
+        counts: (F, *C) counts of F frames.
+        compute: Takes sums of counts over frames (..., *C) to values (..., *V), NaN where a value
+            has no cases.
+
+    Returns:
+        (3, *V) float64: the value for all frames, and the low and high end of its interval. NaN
+        where there is none. Replicates without cases are left out.
+    """
+    counts = np.asarray(counts, np.float64)
+    frames, shape = len(counts), counts.shape[1:]
+    flat = counts.reshape(frames, int(np.prod(shape)))
+    value = np.asarray(compute(flat.sum(axis=0).reshape(shape)), np.float64)
+    if frames == 0:
+        return np.stack([value, np.full(value.shape, np.nan), np.full(value.shape, np.nan)])
+    rng, replicates = np.random.default_rng(params.seed), []
+    step = max(1, MAX_DRAWS // frames)
+    for first in range(0, params.replicates, step):
+        rows = min(step, params.replicates - first)
+        # How often each frame was drawn: the multinomial weights of its counts.
+        indices = rng.integers(frames, size=(rows, frames)) + frames * np.arange(rows)[:, None]
+        weights = np.bincount(indices.ravel(), minlength=rows * frames).reshape(rows, frames)
+        replicates.append(compute((weights @ flat).reshape(rows, *shape)))
+    limits = _compute_limits(np.concatenate(replicates), params.level)
+    return np.stack([value, *np.where(np.isnan(value), np.nan, limits)])
+
+
+def _compute_limits(replicates: np.ndarray, level: float) -> np.ndarray:
+    """Return the ends (2, *V) of the interval of replicates (R, *V); NaN where all are NaN."""
+    empty = np.isnan(replicates).all(axis=0)
+    ends = np.nanpercentile(np.where(empty, 0.0, replicates),  # NumPy warns about columns of NaN
+                            [50 - 50 * level, 50 + 50 * level], axis=0)
+    return np.where(empty, np.nan, ends)
+
+
+def divide(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Return part / whole; NaN where whole is 0."""
+    part, whole = np.broadcast_arrays(np.asarray(part, float), np.asarray(whole, float))
+    return np.divide(part, whole, out=np.full(part.shape, np.nan), where=whole != 0)
+
+
+def compute_rates(tp: np.ndarray, fp: np.ndarray, fn: np.ndarray) -> np.ndarray:
+    """Return recall, precision and F1 (..., 3) in percent of counts (...,); NaN without cases."""
+    return 100 * np.stack([divide(tp, tp + fn), divide(tp, tp + fp),
+                           divide(2 * tp, 2 * tp + fp + fn)], axis=-1)
+
+
+def make_cells(estimates: np.ndarray, paper: Iterable[float | None] = (),
+               digits: int | Iterable[int] = 1) -> tuple[Cell, ...]:
+    """Return the cells of estimates (3, V) of bootstrap().
+
+    Args:
+        paper: The paper's values in the same order, or none.
+        digits: Decimals of each value, or of all.
+    """
+    count = estimates.shape[1]
+    paper = [*paper] or [None] * count
+    digits = [digits] * count if isinstance(digits, int) else [*digits]
+    return tuple(Cell(value, low, high, published, shown)
+                 for (value, low, high), published, shown in
+                 zip(map(nan_to_none, estimates.T), paper, digits, strict=True))
+
+
+def make_line(label: str, x: Iterable[float], estimates: np.ndarray) -> Line:
+    """Return the curve of estimates (3, X) of bootstrap(), with its interval."""
+    value, low, high = map(nan_to_none, estimates)
+    return Line(label, tuple(x), value, low, high)
+
+
+def stack_counts(rows: list, *shape: int) -> np.ndarray:
+    """Return (F, *shape) float64 of one entry for each frame; F may be 0."""
+    return np.array(rows, np.float64).reshape(len(rows), *shape)
+
+
+def nan_to_none(values: Iterable[float]) -> list[float | None]:
+    """Return the values as a list of floats, with None for NaN."""
+    return [None if np.isnan(v) else float(v) for v in values]

@@ -1,0 +1,57 @@
+"""The verb realism: compares simulated scans with real ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from experiments.realism.compare import evenly, measured_scans, side_by_side
+from experiments.realism.report import draw_realism, print_realism
+from lidar_perception.candidates.configurations import PAPER
+from lidar_perception.candidates.warm_up import warm_up
+from lidar_perception.cli.command import Command
+from lidar_perception.cli.data import data_argument, opened, out_file, write_json
+from lidar_perception.data.frame import BOXES
+from lidar_perception.runs.terminal import console, show_progress
+from lidar_perception.simulation.recording import simulate_frames
+from lidar_perception.simulation.scene import MAX_PEOPLE, Scenes
+from lidar_perception.simulation.sensor import find_sensor
+
+
+@click.command(cls=Command)
+@data_argument("Real labelled scans: a data set or bag.")
+@click.option("--sensor", default="hdl64e", show_default=True, help="Sensor to simulate, as in "
+              "`lidar-perception simulate`.")
+@click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
+              help="Height of the sensor above the ground. Default: that of its file or preset.")
+@click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
+              help="Number of simulated scans, each of another street.")
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
+@click.option("--people", type=click.FloatRange(0, MAX_PEOPLE), default=1.0, show_default=True,
+              help="Pedestrians and cyclists, as a multiple of the usual number.")
+@out_file("--json", "Write every curve to this file.")
+@out_file("--png", "Draw every curve into this file.")
+def realism(data: Path, sensor: str, mount_height: float, frames: int, seed: int, people: float,
+            json: Path | None, png: Path | None) -> None:
+    """Compare scans of simulated streets with the labelled ones of DATA, curve by curve.
+
+    \b
+    Example:
+      ./lidar realism /data/kitti/object --png realism.png
+    """
+    model = find_sensor(sensor, mount_height)
+    recording = opened(data)
+    recording.require(BOXES, "realism")
+    chosen = evenly(recording)
+    warm_up()
+    measured = measured_scans(show_progress(chosen, "measuring real scans", len(chosen)), PAPER)
+    made = simulate_frames(seed, frames, model, streets_of=1, scenes=Scenes(None, people, "street"))
+    simulated = measured_scans(show_progress(made, "measuring simulated scans", frames), PAPER)
+    content = {"data": str(data), "seed": seed, **side_by_side(measured, simulated)}
+    print_realism(content, console)
+    write_json(json, content)
+    if png:
+        draw_realism(png, content)
+        console.print(f"picture: {png}")
+

@@ -1,0 +1,1 @@
+"""The experiment of the STM-CPA paper (paper A)."""

@@ -1,0 +1,29 @@
+"""Parameters of the STM-CPA experiment. They are part of the settings of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class StmCpaParams:
+    """Values that the paper varies, Sections 4.2 and 4.5.
+
+    The paper does not list the eps and min_samples that it tried; these include all that it
+    mentions.
+
+    Attributes:
+        search_distance: Largest distance of 3D centres of a hit in the parameter search, metres.
+        cpa_steps: The CPA sweep goes from 0 to this number of steps,
+        cpa_min_range, cpa_max_range: at these horizontal ranges, metres.
+        iou_limits: Overlaps of Table 8.
+    """
+
+    search_eps: tuple[float, ...] = (0.10, 0.15, 0.20, 0.25, 0.30, 0.35, 0.40, 0.45, 0.50, 0.55,
+                                     0.60, 0.70, 0.80)
+    search_min_samples: tuple[int, ...] = (5, 10, 15, 20, 30)
+    search_distance: float = 0.5
+    cpa_steps: int = 8
+    cpa_min_range: float = 15.0
+    cpa_max_range: float = 60.0
+    iou_limits: tuple[float, ...] = (0.10, 0.25)

@@ -1,1 +1,0 @@
-"""Every detector on the same frames, side by side."""

@@ -1,0 +1,219 @@
+"""compare: all detectors on the same frames, what is missing, the figure."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+
+import detection_samples
+import numpy as np
+import pointnet_samples
+import pytest
+from cli_samples import error_line, exit_of
+from click.testing import CliRunner
+from kitti_samples import tracking_folder
+from samples import crowd_folder, object_folder, walker_label, write
+
+from experiments.__main__ import cli, main
+from experiments.comparison.contenders import open_contenders
+from experiments.comparison.outcomes import ComparisonReport, Contender, rotate, start_comparison
+from experiments.comparison.report import spread_heights
+from lidar_perception.data.open import open_recording
+from lidar_perception.detectors.checkpoint import Header, save_checkpoint
+from lidar_perception.detectors.contract import DetectionResult
+from lidar_perception.detectors.pointnet import weights_file as pointnet_weights
+from lidar_perception.detectors.pointpillars import weights_file as pointpillars_weights
+from lidar_perception.scoring.kitti.protocol import SCORED
+from lidar_perception.scoring.run import fill
+from lidar_perception.types import Detections, InputError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+CANDIDATES = ["STM-CPA paper", "STM-CPA best", "STM-CPA best, auto"]
+ROW = {"weights", "classes", "ap", "mean_ap", "pedestrian_centres", "ms", "ms_of_frames", "frames",
+       "failed"}
+
+
+@pytest.fixture
+def bare(monkeypatch, tmp_path):
+    """A package without weights."""
+    monkeypatch.setattr(pointpillars_weights, "WEIGHTS", tmp_path / "none")
+    monkeypatch.setattr(pointnet_weights, "WEIGHTS", tmp_path / "none.safetensors")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """Random networks: PointPillars v0 compact twice, and a PointNet."""
+    folder = tmp_path_factory.mktemp("weights")
+    config = detection_samples.tiny()
+    for name, seed in ("a", 0), ("b", 1):
+        save_checkpoint(folder / name, detection_samples.lively(config, seed), Header(config))
+    config = pointnet_samples.small()
+    save_checkpoint(folder / "c", pointnet_samples.lively(config), Header(config))
+    return folder
+
+
+def run(tmp_path, *arguments) -> tuple[dict, str]:
+    path = tmp_path / "made/scores.json"
+    result = CliRunner().invoke(cli, ["compare", "--json", str(path), *map(str, arguments)],
+                                catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return json.loads(path.read_text()), result.stdout
+
+
+def taken(root, *detectors) -> dict:
+    """The report of detectors: functions of a frame to a detector, or None."""
+    contenders = [Contender(str(i), each) for i, each in enumerate(detectors)]
+    report = ComparisonReport(contenders)
+    fill(report, open_recording(root), partial(start_comparison, lambda: contenders))
+    return report.compute()
+
+
+def saying(say):
+    """What gives a detector for each frame that says what say(frame) gives, Detections."""
+    return lambda frame: lambda scan: DetectionResult(say(frame))
+
+
+def right(frame, score=0.9) -> Detections:
+    truth = frame.truth()
+    return Detections.of(truth.boxes, truth.class_ids, score)
+
+
+def test_all_detectors_are_compared_and_what_is_missing_is_listed(bare, weights, tmp_path,
+                                                                 monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    root, png = crowd_folder(tmp_path / "kitti", 3), tmp_path / "pictures/compare.png"
+    given = [word for name in "acb" for word in ("--weights", weights / name)]
+    content, text = run(tmp_path, "--data", root, *given, "--png", png, "--device", "cpu")
+    assert [*content["rows"]] == [
+        *CANDIDATES, "PointPillars v0 compact", "PointNet", "PointPillars v0 compact #2"]
+    assert {each["name"] for each in content["missing"]} == {"fused"} | {
+        f"PointPillars v{i} {size}" for i in range(5) for size in ("full", "compact")
+        if (i, size) != (0, "compact")}
+    assert (content["frames"], content["pedestrians"]) == (3, {"frames": 2, "ground_truth": 8})
+    assert content["objects"]["Pedestrian"]["hard"] == 8
+    for name, row in content["rows"].items():
+        assert row.keys() == ROW and row["ms"] > 0 and row["frames"] == len(row["ms_of_frames"])
+        labelled = name.startswith("STM-CPA") and not name.endswith("auto")
+        assert row["frames"] + len(row["failed"]) == (2 if labelled else 3)
+        used, best = (row["pedestrian_centres"][key] for key in ("operating", "best"))
+        assert used["tp"] + used["fn"] == best["tp"] + best["fn"] == 8
+        assert used["f1"] <= best["f1"]
+        assert (row["classes"] == ["Pedestrian"]) == name.startswith("STM-CPA")
+        assert (row["mean_ap"]["3d"] is None) == name.startswith("STM-CPA")
+        assert name in text
+    assert content["rows"]["PointPillars v0 compact #2"]["weights"] == str(weights / "b")
+    assert png.read_bytes().startswith(b"\x89PNG")
+    assert "missing" in text and "v4 full" in text and "AVOD" in text
+    lines = [line for line in text.splitlines()
+             if str(tmp_path) not in line and not line.startswith("missing: ")]
+    assert max(map(len, lines)) <= 100 and "…" not in text
+
+
+def test_without_networks_the_candidates_are_compared_in_any_layout(bare, tmp_path):
+    content, _ = run(tmp_path, "--data", tracking_folder(tmp_path / "kitti"), "--limit", 2,
+                     "--png", tmp_path / "a.png")
+    assert [*content["rows"]] == CANDIDATES and content["frames"] == 2
+    reasons = {each["name"]: each["reason"] for each in content["missing"]}
+    assert len(reasons) == 12 and "--weights" in reasons["PointNet"]
+    assert (tmp_path / "a.png").stat().st_size > 0
+    frame, _ = open_recording(crowd_folder(tmp_path / "crowd", 2))  # as of a bag without a camera
+    found, _ = open_contenders([], "cpu", 1.73)
+    scan, blind = frame.load(), replace(frame, calibration=lambda: None)
+    whole, cropped = ([len(each.make_detector(one)(scan).detections) for each in found]
+                      for one in (blind, frame))
+    assert whole >= cropped > [0, 0, 0]
+
+
+def test_a_detector_that_finds_everything_has_100_and_one_that_fails_goes_on(tmp_path):
+    root = object_folder(tmp_path, walker_label(), count=3)
+
+    def fails(frame):
+        if frame.name == "000001":
+            raise InputError("too dark")
+        return right(frame)
+
+    def broken(frame):
+        return Detections.of(np.vstack([frame.truth().boxes, np.full((1, 7), np.nan)]))
+
+    whole, failing, other, nan = taken(root, saying(right), saying(fails), lambda frame: None,
+                                       saying(broken))["rows"].values()
+    assert whole["ap"]["Pedestrian"]["3d"]["moderate"] == 100 == whole["mean_ap"]["3d"]
+    assert whole["pedestrian_centres"]["operating"]["f1"] == 1 and whole["failed"] == []
+    assert (failing["frames"], failing["failed"]) == (2, ["000001: too dark"])
+    assert failing["pedestrian_centres"]["operating"]["fn"] == 1
+    assert (other["frames"], other["failed"], other["ms"]) == (0, [], None)
+    assert other["pedestrian_centres"]["best"] == {**other["pedestrian_centres"]["operating"],
+                                                   "score": None}
+    assert len(nan["failed"]) == 3 and nan["ap"]["Pedestrian"]["3d"]["moderate"] == 100
+
+
+def test_pedestrians_count_from_the_operating_score_on(tmp_path):
+    root = object_folder(tmp_path, walker_label(), count=1)
+
+    row, = taken(root, saying(lambda frame: right(frame, 0.2)))["rows"].values()
+    row = row["pedestrian_centres"]
+    assert (row["operating"]["tp"], row["best"]["tp"]) == (0, 1)
+    assert row["best"]["score"] == pytest.approx(0.2)
+
+
+def test_detectors_take_turns(tmp_path):
+    for count in range(5):
+        items = list(range(count))
+        orders = [rotate(items, turn) for turn in range(2 * count)]
+        assert all(sorted(order) == items for order in orders)
+        for place in range(count):
+            assert sorted(order[place] for order in orders) == sorted(2 * items)
+    said = []
+    taken(object_folder(tmp_path, walker_label(), count=3),
+          *(lambda frame, i=i: said.append((frame.name, i)) for i in range(3)))
+    first, *rest = (said[i:i + 3] for i in range(0, len(said), 3))
+    assert first == rest[0] and len(rest) == 3  # the first frame once more before it counts
+    assert [frame[0][1] for frame in rest] == [0, 1, 2]
+
+
+def test_what_cannot_be_read_is_skipped(tmp_path):
+    root = object_folder(tmp_path, walker_label(), count=2)
+    write(root / "training/velodyne/000000.bin", b"123")
+    content = taken(root, saying(lambda frame: Detections.none()))
+    line, = content["skipped"]
+    assert content["frames"] == content["rows"]["0"]["frames"] == 1 and "000000.bin" in line
+
+
+def test_a_class_without_labels_is_left_out_of_the_mean(tmp_path):
+    root = object_folder(tmp_path, walker_label(), count=1)
+    row, = taken(root, saying(lambda frame: Detections.none()))["rows"].values()
+    assert row["mean_ap"] == dict.fromkeys(row["mean_ap"], 0.0)
+    assert [row["ap"][name]["3d"]["moderate"] for name in SCORED] == [None, 0.0, None]
+
+
+def test_names_in_the_figure_keep_their_distance():
+    rng = np.random.default_rng(0)
+    for count in (1, 2, 5, 20, 60):
+        values = rng.choice([rng.uniform(0, 100), 0, 50, 100], count) + rng.normal(0, 2, count)
+        places = spread_heights(values, 0, 100, 4)
+        gaps = np.diff(np.sort(places))
+        assert (gaps > min(4, 100 / max(count - 1, 1)) - 1e-9).all()
+        assert places.min() >= -1e-9 and places.max() <= 100 + 1e-9
+        order = np.argsort(values, kind="stable")
+        assert (np.diff(places[order]) > 0).all()
+    apart = np.array([80.0, 10, 30])
+    np.testing.assert_allclose(spread_heights(apart, 0, 100, 4), apart)
+
+
+@pytest.mark.parametrize("case", ["labels", "weights", "folder"])
+def test_bad_input_is_one_line(case, bare, tmp_path, monkeypatch, capsys):
+    root = object_folder(tmp_path / "kitti")
+    arguments = ["--data", root]
+    if case == "labels":
+        for path in (root / "training/label_2").iterdir():
+            path.unlink()
+        expected = "no frame with labels"
+    elif case == "weights":
+        arguments += ["--weights", tmp_path / "w"]
+        expected = f"there is no checkpoint {tmp_path / 'w'}"
+    else:
+        arguments, expected = ["--data", tmp_path / "none"], f"{tmp_path / 'none'} does not exist"
+    assert exit_of(monkeypatch, "compare", *arguments, run=main) == 2
+    assert expected in error_line(capsys)

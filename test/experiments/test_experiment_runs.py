@@ -1,0 +1,363 @@
+"""Laws of a run: however it is spread or stopped, the records are the same, and bad input costs the
+frames that it hits and no others. Every number is in every format of its report."""
+
+from __future__ import annotations
+
+import csv
+import html
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from multiprocessing import forkserver
+from pathlib import Path
+
+import pytest
+from experiment_samples import (
+    COUNT,
+    SMALL,
+    command,
+    count_points,
+    lines_of,
+    points_table,
+    small,
+    untimed,
+)
+from samples import object_folder, wait_for_the_end, write
+
+from experiments.framework import report_files
+from experiments.framework.experiment import Cell
+from experiments.framework.report import format_cell, write_report
+from experiments.framework.runner import run_experiment
+from experiments.stm_cpa.experiment import STM_CPA
+from lidar_perception.data.open import open_recording
+from lidar_perception.runs import journal
+from lidar_perception.scoring import run as scoring_run
+from lidar_perception.types import InputError
+
+pytestmark = pytest.mark.no_cover  # others run these lines
+
+ROOT = Path(__file__).resolve().parents[2]
+TIMED = {"table_9", "table_9_median"}
+
+
+def break_down(frames, number):
+    if number == 2:
+        raise ZeroDivisionError("a mistake")
+    return {"frame": frames[number].name}
+
+
+def not_json(frames, number):
+    return {"frame": frames[number].name, "value": float("nan")}
+
+
+def end_the_process(frames, number):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def content(folder):
+    """Name to content of the files that hold no times."""
+    return {path.name: path.read_bytes() for path in sorted(folder.rglob("*"))
+            if path.suffix in (".csv", ".png") and path.stem not in TIMED}
+
+
+# However it is spread and stopped
+
+
+def test_a_cluster_of_two_workers_measures_what_one_process_does(crowds, whole, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="needs the extra [distributed]")
+    from dask import config
+    forked = config.set({"distributed.worker.multiprocessing-method": "forkserver"})
+    with forked, distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True,
+                                          dashboard_address=None) as cluster:
+        address = cluster.scheduler_address
+        run_experiment(STM_CPA, open_recording(crowds), tmp_path / "out", dask=address)
+        with pytest.raises(ZeroDivisionError):
+            run_experiment(small(break_down), open_recording(crowds), tmp_path / "broken",
+                           dask=address)
+    assert untimed(tmp_path / "out") == untimed(whole)
+
+
+def test_a_cluster_that_is_not_there_is_named(few, tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="needs the extra [distributed]")
+    monkeypatch.setattr(scoring_run, "CONNECT_S", 0.2)
+    with pytest.raises(InputError, match="cannot reach a Dask scheduler"):
+        run_experiment(SMALL, open_recording(few), tmp_path / "out", dask="tcp://127.0.0.1:9")
+
+
+def test_without_distributed_the_extra_is_named(few, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"lidar_perception\[distributed\]"):
+        run_experiment(SMALL, open_recording(few), tmp_path / "out", dask="tcp://127.0.0.1:9")
+
+
+def test_a_killed_run_of_two_processes_goes_on_where_it_was(crowds, whole, tmp_path):
+    out = tmp_path / "out"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "experiments", "reproduce", "--data", str(crowds),
+         "--out", str(out), "--jobs", "2"], cwd=ROOT, start_new_session=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE)
+    while len(lines_of(out)) < 4:
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.005)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    wait_for_the_end(process.pid)  # its children end by themselves
+    assert "Traceback" not in process.communicate()[1]
+    kept = lines_of(out)
+    assert 4 <= len(kept)  # on a busy machine all may be measured before the signal comes
+    command("--data", crowds, "--out", out, "--jobs", 1)
+    assert untimed(out) == untimed(whole)
+    assert content(out) == content(whole)
+    assert set(kept[:4]) <= set(lines_of(out))  # with their times: they were not measured again
+
+
+@pytest.mark.parametrize("cut", [1, 2, 40])
+def test_a_cut_last_line_is_dropped_and_its_frame_measured_again(few, tmp_path, cut):
+    expected = run_experiment(SMALL, open_recording(few), tmp_path / "out")
+    path = tmp_path / "out" / journal.JOURNAL_NAME
+    bytes_before = path.read_bytes()
+    path.write_bytes(bytes_before[:-cut])
+    assert run_experiment(SMALL, open_recording(few), tmp_path / "out") == expected
+    assert path.read_bytes() == bytes_before
+
+
+def test_what_is_there_is_not_measured_again(few, tmp_path, monkeypatch):
+    expected = run_experiment(SMALL, open_recording(few), tmp_path / "out", limit=2)
+    assert [r["frame"] for r in expected] == ["000000", "000001"]
+    asked = []
+
+    def noted(frames, number):
+        asked.append(number)
+        return count_points(frames, number)
+
+    assert run_experiment(small(noted), open_recording(few), tmp_path / "out")[:2] == expected
+    assert asked == [2, 3, 4]
+    assert len(run_experiment(small(noted), open_recording(few), tmp_path / "out", limit=1)) == 1
+    assert asked == [2, 3, 4]
+    assert len(lines_of(tmp_path / "out")) == 1 + 4  # the plan, and what was not skipped
+
+
+def test_a_frame_that_was_skipped_is_tried_again(few, tmp_path):
+    scan = few / "training/velodyne/000001.bin"
+    whole = scan.read_bytes()
+    scan.write_bytes(whole[:100])
+    first = run_experiment(SMALL, open_recording(few), tmp_path / "out")
+    assert "000001.bin" in first[1]["skipped"] and "000001.bin" in first[2]["skipped"]
+    scan.write_bytes(whole)
+    resumed, anew = (run_experiment(SMALL, open_recording(few), tmp_path / name)
+                     for name in ("out", "again"))
+    assert resumed == anew
+
+
+# What is in the way
+
+
+def test_another_plan_is_an_error_that_names_what_differs(few, tmp_path):
+    out = tmp_path / "out"
+    run_experiment(small(limits=(1, 2), deep={"a": 1, "b": 2}), open_recording(few), out)
+    before = (out / journal.JOURNAL_NAME).read_bytes()
+    with pytest.raises(InputError, match=r"settings.deep.b 2, not 3; .*--force") as error:
+        run_experiment(small(limits=(1, 2), deep={"a": 1, "b": 3}), open_recording(few), out)
+    assert "deep.a" not in str(error.value) and "limits" not in str(error.value)
+    other = object_folder(tmp_path / "other", count=4)
+    with pytest.raises(InputError, match=r"data '.*few', not '.*other'; frames 5, not 4"):
+        run_experiment(small(limits=(1, 2), deep={"a": 1, "b": 2}), open_recording(other), out)
+    assert (out / journal.JOURNAL_NAME).read_bytes() == before
+    run_experiment(SMALL, open_recording(other), out, force=True)
+    assert len(run_experiment(SMALL, open_recording(other), out)) == 4
+
+
+def test_a_folder_of_something_else_is_left_alone(few, tmp_path):
+    out = tmp_path / "mine"
+    write(out / "letter.txt", "dear")
+    write(out / "figures/photo.png", "me")
+    with pytest.raises(InputError, match=f"{out} exists already.*--force"):
+        run_experiment(SMALL, open_recording(few), out)
+    assert sorted(p.name for p in out.rglob("*.*")) == ["letter.txt", "photo.png"]
+    run_experiment(SMALL, open_recording(few), out, force=True)
+    assert (out / "letter.txt").read_text() == "dear" and (out / "figures/photo.png").exists()
+    with pytest.raises(InputError, match="is a file"):
+        run_experiment(SMALL, open_recording(few), out / "letter.txt")
+    with pytest.raises(InputError, match="cannot make the folder"):
+        run_experiment(SMALL, open_recording(few), out / "letter.txt/deeper")
+
+
+def test_force_begins_anew_and_leaves_no_old_table_and_what_is_not_the_runs(whole, few, tmp_path):
+    out = shutil.copytree(whole, tmp_path / "out")
+    theirs = {write(out / "tables/mine.csv", "me"), write(out / "figures/photo.png", "me")}
+    records = run_experiment(SMALL, open_recording(few), out, force=True)
+    assert {*out.rglob("*.*")} == {out / journal.JOURNAL_NAME, *theirs}
+    write_report(out, SMALL, records, points_table(records), {})
+    assert {p.stem for p in out.rglob("*.csv")} == {"points", "mine"}
+
+
+@pytest.mark.parametrize("first", ["", "{", "[]", '{"frame": "000000"}'])
+def test_a_journal_without_a_plan_is_not_gone_on_with(few, tmp_path, first):
+    write(tmp_path / "out" / journal.JOURNAL_NAME, first + "\n")
+    with pytest.raises(InputError, match=r"cannot read .*--force"):
+        run_experiment(SMALL, open_recording(few), tmp_path / "out")
+    assert len(run_experiment(SMALL, open_recording(few), tmp_path / "out", force=True)) == 5
+
+
+def test_two_runs_do_not_write_one_folder(few, tmp_path):
+    with (journal.open_journal(tmp_path / "out", {}) as _,
+          pytest.raises(InputError, match="another process")):
+        run_experiment(SMALL, open_recording(few), tmp_path / "out", force=True)
+
+
+def test_a_full_disk_is_one_line_and_the_rest_goes_on_later(few, tmp_path, monkeypatch):
+    def full(self):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(journal, "SYNC_S", -1.0)
+        patch.setattr(journal.Journal, "sync", full)
+        with pytest.raises(InputError, match=r"No space left.*the same command resumes"):
+            run_experiment(SMALL, open_recording(few), tmp_path / "out")
+    assert len(run_experiment(SMALL, open_recording(few), tmp_path / "out")) == 5
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_mistake_in_an_experiment_is_not_a_skipped_frame(few, tmp_path, jobs, capfd):
+    if jobs > 1:
+        forkserver._forkserver._stop()  # processes say it where their server was started
+    with pytest.raises((ZeroDivisionError, InputError)) as error:
+        run_experiment(small(break_down), open_recording(few), tmp_path / "out", jobs=jobs)
+    said = capfd.readouterr().err + "".join(getattr(error.value, "__notes__", []))
+    assert "while frame 000002 was measured" in said
+    assert '"000002"' not in "".join(lines_of(tmp_path / "out"))
+
+
+def test_a_record_that_is_no_json_is_a_mistake(few, tmp_path):
+    with pytest.raises(ValueError, match="JSON"):
+        run_experiment(small(not_json), open_recording(few), tmp_path / "out")
+
+
+def test_a_process_that_is_killed_ends_the_run_with_a_reason(few, tmp_path):
+    with pytest.raises(InputError, match=r"measured frames.*out of memory: try fewer --jobs"):
+        run_experiment(small(end_the_process), open_recording(few), tmp_path / "out", jobs=2)
+
+
+# Broken frames
+
+
+BROKEN = {
+    "velodyne/000000.bin": lambda b: b[:1003],        # cut
+    "velodyne/000001.bin": lambda b: b"",             # empty
+    "label_2/000002.txt": lambda b: b[:-30],          # cut in a line
+    "label_2/000003.txt": lambda b: b.replace(b"1.", b"nan ", 1),
+    "label_2/000004.txt": None,                       # not there
+    "calib/000005.txt": None,
+    "calib/000006.txt": lambda b: b[:200],
+    "calib/000007.txt": lambda b: re.sub(rb"(Tr_velo_to_cam:).*", rb"\1" + b" 0" * 12, b),
+    "velodyne/000008.bin": None,
+    "calib/000009.txt": lambda b: re.sub(rb"(R0_rect:) \S+", rb"\1 -1", b),  # mirrored
+}
+
+
+def test_broken_frames_are_skipped_by_name_and_the_others_are_as_before(crowds, whole, tmp_path):
+    root = tmp_path / "kitti"
+    shutil.copytree(crowds, root)
+    for name, change in BROKEN.items():
+        path = root / "training" / name
+        if change is None:
+            path.unlink()
+        else:
+            path.write_bytes(change(path.read_bytes()))
+    found = run_experiment(STM_CPA, open_recording(root), tmp_path / "out")
+    records = {record["frame"]: record for record in found}
+    assert len(records) == COUNT
+    for name in BROKEN:
+        frame = Path(name).stem
+        reason = records[frame]["skipped"]
+        assert frame in reason and len(reason.splitlines()) == 1, reason
+        named = "velodyne/000004.bin" if name == "label_2/000004.txt" else name
+        assert (named if named != "velodyne/000008.bin" else "label_2/000008.txt") in reason
+    expected = {r["frame"]: r for r in untimed(whole)}
+    for name, record in records.items():
+        if "skipped" not in record:
+            assert {k: v for k, v in record.items() if k != "ms"} == expected[name]
+    assert sum("skipped" not in r for r in records.values()) == COUNT - len(BROKEN) - 1
+
+
+def test_a_split_leaves_out_all_else(few, tmp_path):
+    (few / "training/velodyne/000004.bin").unlink()
+    split = write(tmp_path / "split.txt", "000002\n000000\n")
+    whole = open_recording(few)
+    assert [name for name, _ in whole.missing_scans] == ["000004"]
+    records = run_experiment(SMALL, open_recording(few, split=split), tmp_path / "out")
+    assert [(r["frame"], "skipped" in r) for r in records] == [("000002", False), ("000000", False)]
+    assert [r["frame"] for r in run_experiment(SMALL, whole, tmp_path / "all")][-1] == "000004"
+
+
+def test_a_folder_without_scans_or_pedestrians_is_an_error(tmp_path):
+    for argument, words in ((tmp_path / "none", "does not exist"),
+                            (tmp_path, "is not a recording in a supported format")):
+        with pytest.raises(InputError, match=words):
+            command("--data", argument, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    nobody = object_folder(tmp_path / "nobody", "")
+    with pytest.raises(InputError, match=r"no frame could be measured.*no Pedestrian"):
+        command("--data", nobody, "--out", tmp_path / "out", "--jobs", 1)
+    assert json.loads((tmp_path / "out/report.json").read_text())["skipped"] == 2
+
+
+# The report and the summary
+
+
+def test_every_table_and_figure_is_in_every_format(whole):
+    report = json.loads((whole / "report.json").read_text())
+    page = html.unescape((whole / "report.html").read_text())
+    markdown = (whole / "report.md").read_text()
+    tables = [t for section in report["sections"] for t in section["tables"]]
+    assert {t["name"] for t in tables} >= {"table_1", "table_3_6", "table_4", "table_5", "table_8",
+                                           "table_9", "search", "search_best", "figure_8"}
+    assert {p.stem for p in (whole / "tables").iterdir()} == {t["name"] for t in tables}
+    for table in tables:
+        assert table["title"] in page and f"**{table['title']}**" in markdown
+        rows = [[Cell(**c) if isinstance(c, dict) else c for c in row] for row in table["rows"]]
+        read = list(csv.DictReader((whole / f"tables/{table['name']}.csv").open()))
+        assert len(read) == len(rows)
+        for row, there in zip(rows, read):
+            for name, cell in zip(table["header"], row):
+                if isinstance(cell, str):
+                    assert there[name] == cell
+                    continue
+                for key, value in ((name, cell.value), (f"{name} low", cell.low),
+                                   (f"{name} high", cell.high), (f"{name} paper", cell.paper)):
+                    assert there[key] == ("" if value is None else str(value))
+                value, interval, published = format_cell(cell)
+                assert value in page and interval in page and interval in markdown
+                assert not published or (f"paper {published}" in page
+                                         and f"(paper {published})" in markdown)
+    for figure in (f for section in report["sections"] for f in section["figures"]):
+        picture = whole / f"figures/{figure['name']}.png"
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        assert figure["title"] in page and f"(figures/{figure['name']}.png)" in markdown
+    assert {p for p in whole.rglob("*") if p.is_file()} == {whole / journal.JOURNAL_NAME,
+                                                             *report_files.list_report_files(whole)}
+
+
+def test_the_page_needs_no_other_file_and_says_what_was_run(whole, crowds):
+    page = (whole / "report.html").read_text()
+    assert not re.findall(r'(?:src|href|srcset)="(?!data:|#)', page) and "<script" not in page
+    assert str(crowds) in page and "11 measured, 1 skipped" in page and "lidar_perception" in page
+    assert "no Pedestrian is labelled" in page
+    report = json.loads((whole / "report.json").read_text())
+    assert (report["measured"], report["skipped"]) == (11, 1)
+    assert [r["frame"] for r in report["skipped_frames"]] == ["000011"]
+
+
+def test_the_summary_shows_the_scores_beside_the_papers(whole):
+    text = (whole.parent / "said").read_text()
+    report = json.loads((whole / "report.json").read_text())
+    row = next(t for s in report["sections"] for t in s["tables"]
+               if t["name"] == "table_3_6")["rows"][2]
+    assert f"{row[1]['value']:.1f} (46.7)" in text and f"{row[3]['value']:.1f} (52.1)" in text
+    assert f"report: {whole}/report.html" in text.replace("\n", "")
+    assert "skipped 1: no Pedestrian" in text
