@@ -10,12 +10,12 @@ import click
 
 from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import (
-    Walk,
+    ScoringOptions,
     a_path,
     intervals_option,
-    no_labels,
+    no_labels_error,
     out_file,
-    walk_options,
+    scoring_options,
 )
 from lidar_perception.cli.options import (
     Runs,
@@ -36,7 +36,7 @@ def _list_runs() -> list[Runs]:
 
 
 @click.command(cls=Command)
-@walk_options()
+@scoring_options()
 @a_path("--weights", "One more detector: weights of PointPillars or PointNet, or a class of your "
         "own, module:Class; may be repeated.",
         multiple=True)
@@ -45,8 +45,8 @@ def _list_runs() -> list[Runs]:
 @range_option
 @device_option
 @settings_options(lambda given: _list_runs(), candidates=True)
-def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, range: str, device: str,
-            settings: Settings, intervals: int) -> None:
+def compare(options: ScoringOptions, weights: tuple[Path, ...], png: Path | None, range: str,
+            device: str, settings: Settings, intervals: int) -> None:
     """Run all detectors on the same frames, in turns, and print scores and times side by side.
 
     The detectors are STM-CPA (`paper` and `best`), PointPillars V0 to V4 in both sizes, PointNet
@@ -69,24 +69,24 @@ def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, range: str,
 
     runs = _list_runs() if settings else []
     values = {run.name: chosen for run, chosen in zip(runs, settings.values(*runs))}
-    recording = walk.opened(BOXES)
+    recording = options.open_recording(BOXES)
     with errors.status("loading detectors"):
         height = recording.frames[0].sensor_height
         contenders, missing = open_contenders(weights, device, height, range, values)
-    open_ = (lambda: contenders) if walk.here else partial(
+    open_ = (lambda: contenders) if options.in_this_process else partial(
         open_contenders_alone, weights, device, height, range, values)
     report = ComparisonReport(contenders, intervals, recording.is_sequential)
-    walk.fill(report, recording, partial(start_comparison, open_), title="comparing")
+    options.fill(report, recording, partial(start_comparison, open_), title="comparing")
     if not report.first.frames:
-        raise no_labels(recording, report.skipped)
+        raise no_labels_error(recording, report.skipped)
     centres = report.first.pedestrians.compute()
     content = {
-        "source": str(walk.data), "machine": read_cpu_name(), "device": device,
+        "source": str(options.data), "machine": read_cpu_name(), "device": device,
         "python": platform.python_version(), **report.compute(),
         "pedestrians": {key: centres[key] for key in ("frames", "ground_truth")},
         "missing": [vars(detector) for detector in missing], "paper_f1": CENTRE_F1}
     print_comparison(content, console)
-    walk.write(content)
+    options.write(content)
     if png is not None:
         draw_comparison(png, content)
         console.print(f"figure: {png}")

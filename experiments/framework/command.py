@@ -19,7 +19,7 @@ from lidar_perception.cli.data import (
     a_path,
     dask_option,
     limit_option,
-    opened,
+    open_and_describe,
     out_folder,
     split_option,
 )
@@ -72,7 +72,7 @@ def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out
     from lidar_perception.runs.terminal import console
 
     experiment = load_experiment(name)
-    recording = opened(data, split=split)
+    recording = open_and_describe(data, split=split)
     recording.require(BOXES, "reproduce")
     started, before = datetime.now().astimezone(), perf_counter()
     workers = jobs or count_cores()

@@ -11,7 +11,7 @@ from experiments.realism.report import draw_realism, print_realism
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import data_argument, opened, out_file, write_json
+from lidar_perception.cli.data import data_argument, open_and_describe, out_file, write_json
 from lidar_perception.data.frame import BOXES
 from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.simulation.recording import simulate_frames
@@ -41,7 +41,7 @@ def realism(data: Path, sensor: str, mount_height: float, frames: int, seed: int
       ./lidar realism /data/kitti/object --png realism.png
     """
     model = find_sensor(sensor, mount_height)
-    recording = opened(data)
+    recording = open_and_describe(data)
     recording.require(BOXES, "realism")
     chosen = evenly(recording)
     warm_up()

@@ -13,7 +13,7 @@ import click
 from rich.text import Text
 
 from lidar_perception.cli.command import Choice, Command
-from lidar_perception.cli.data import a_path, limit_option, opened, split_option
+from lidar_perception.cli.data import a_path, limit_option, open_and_describe, split_option
 from lidar_perception.labels.datasets import LAYOUTS
 from lidar_perception.labels.exchange import FORMATS, READERS
 from lidar_perception.labels.names import ALIASES
@@ -87,8 +87,8 @@ def convert(source: Path | None, format: str, out: Path, data: Path | None, give
                                                         "or nuscenes-tracking")):
         if wrong:
             raise click.UsageError(what)
-    recording = opened(source if data is None else data, level=robot is None, split=split,
-                       points=points)
+    recording = open_and_describe(source if data is None else data, level=robot is None,
+                                  split=split, points=points)
     seen = _make_frame_transform(recording, robot, deskew)
     if given_labels:
         _labels(source, recording, format, out, given, data is not None, detections, limit, force)

@@ -21,7 +21,7 @@ from lidar_perception.types import InputError
 WHAT = ("Bag (ROS 2 or ROS 1), KITTI, nuScenes or SemanticKITTI folder, .pcd, .ply, .npy or .bin "
         "files, or the output of `simulate`. BAG:/TOPIC names the clouds of a bag that has "
         "several.")
-MOST_JOBS = 16  # processes by default; as many feed a GPU
+MAX_DEFAULT_JOBS = 16  # processes; enough to feed a GPU
 
 
 def a_path(name: str, what: str, metavar: str = "FILE", **more: Any) -> Callable:
@@ -30,7 +30,7 @@ def a_path(name: str, what: str, metavar: str = "FILE", **more: Any) -> Callable
 
 
 class OutFile(click.Path):
-    """A file to write at the end of a command; refused at the start if it cannot be written."""
+    """A file to write at the end of a command, checked at the start."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
@@ -47,7 +47,7 @@ def out_file(name: str, what: str, *names: str, **more: Any) -> Callable:
 
 
 class OutFolder(click.Path):
-    """A folder to write into. It is checked now and made when there is something to write."""
+    """A folder to write into, checked at the start and created when something is written."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
@@ -63,8 +63,9 @@ def out_folder(what: str, name: str = "--out", **more: Any) -> Callable:
 def jobs_for_all_cores(what: str, least: int = 0) -> Callable:
     """Return the option --jobs, by default one process for each core; `what` starts its help."""
     return click.option("--jobs", type=click.IntRange(least),
-                        default=lambda: min(count_cores(), MOST_JOBS), show_default=f"one for each "
-                        f"core, {MOST_JOBS} at most", help=f"{what} The result is the same.")
+                        default=lambda: min(count_cores(), MAX_DEFAULT_JOBS),
+                        show_default=f"one for each core, {MAX_DEFAULT_JOBS} at most",
+                        help=f"{what} The result is the same.")
 
 
 def data_argument(what: str = WHAT, *, required: bool = True, several: bool = False,
@@ -73,9 +74,9 @@ def data_argument(what: str = WHAT, *, required: bool = True, several: bool = Fa
 
     Args:
         what: help of --data.
-        required: it is an error to give neither; else the function gets data=None, or ().
-        several: any number of them, as a tuple.
-        kind: their type.
+        required: giving neither is an error; otherwise the function gets data=None, or ().
+        several: accept any number of values, as a tuple.
+        kind: type of a value.
     """
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
@@ -116,9 +117,8 @@ browser_option = click.option("--open/--no-open", "browser", default=True,
 
 
 @dataclass(frozen=True)
-class Walk:
-    """Options of a command that scores frames: which frames, in which processes, and the output
-    file."""
+class ScoringOptions:
+    """Options of all commands that score frames: the frames, the processes and the output file."""
 
     data: Any  # a path, or several
     split: Path | None
@@ -128,23 +128,23 @@ class Walk:
     json_file: Path | None
 
     @property
-    def here(self) -> bool:
+    def in_this_process(self) -> bool:
         """True if all frames are scored in this process."""
         return self.jobs == 1 and self.dask is None
 
-    def opened(self, needs: str | None, data: Path | None = None, **how: Any) -> Any:
-        """Open the recording, or another one at `data`, see opened().
+    def open_recording(self, needs: str | None, data: Path | None = None, **how: Any) -> Any:
+        """Open the recording, or another one at `data`, see open_and_describe.
 
         Raises:
             InputError: no frame has what the command needs, such as data.frame.BOXES.
         """
-        recording = opened(data or self.data, split=self.split, **how)
+        recording = open_and_describe(data or self.data, split=self.split, **how)
         if needs is not None:
             recording.require(needs, click.get_current_context().command_path.partition(" ")[2])
         return recording
 
     def fill(self, report: Any, recording: Any, start: Any, title: str = "evaluating") -> None:
-        """See scoring.run.fill."""
+        """Score the frames of the recording, see scoring.run.fill."""
         from lidar_perception.scoring.run import fill
         fill(report, recording, start, limit=self.limit, jobs=self.jobs, dask=self.dask,
              title=title)
@@ -154,27 +154,39 @@ class Walk:
         write_json(self.json_file, content)
 
 
-def walk_options(data: Callable = data_argument()) -> Callable:
+def scoring_options(data: Callable = data_argument(), *, parallel: bool = True) -> Callable:
     """Decorator: DATA, --split, --limit, --jobs, --dask and --json, which the function gets as
-    walk=Walk(...)."""
+    options=ScoringOptions(...).
+
+    Args:
+        data: the argument DATA.
+        parallel: False leaves out --jobs and --dask.
+    """
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
-        def wrapper(*args: Any, data, split, limit, jobs, dask, json_file, **kwargs: Any) -> Any:
+        def wrapper(*args: Any, data, split, limit, json_file, jobs=1, dask=None,
+                    **kwargs: Any) -> Any:
             if dask and jobs > 1:
                 raise click.UsageError("--jobs is for this machine, --dask for others: give one of "
                                        "them")
-            return function(*args, walk=Walk(data, split, limit, jobs, dask, json_file), **kwargs)
+            options = ScoringOptions(data, split, limit, jobs, dask, json_file)
+            return function(*args, options=options, **kwargs)
 
-        for option in (json_option, dask_option, jobs_option, limit_option, split_option, data):
+        processes = (dask_option, jobs_option) if parallel else ()
+        for option in (json_option, *processes, limit_option, split_option, data):
             wrapper = option(wrapper)
         return wrapper
     return decorate
 
 
-def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
-    """Open the recording at a path, see data.open.open_recording, and print its summary. The height
-    of a sensor that the recording does not give is measured, unless it is about KITTI's. With level
-    a sensor that leans and the scale of the intensity are reported."""
+def open_and_describe(data: Path, *, level: bool = True, **how: Any) -> Any:
+    """Open the recording at a path, see data.open.open_recording, and print its summary.
+
+    If the recording does not give the height of the sensor, it is measured on the first clouds.
+
+    Args:
+        level: also report a tilted sensor and the scale of the intensity.
+    """
     from lidar_perception.data.mount_check import (
         apply_measured_height,
         find_mount_problem,
@@ -184,7 +196,7 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     from lidar_perception.wire.messages import diagnose_recorded_intensity
     recording = open_recording(data, **how)
     errors.print(str(recording), style="dim")
-    for line in lost_labels(recording):
+    for line in describe_missing_scans(recording):
         errors.print(line, style="yellow")
     clouds = load_first_clouds(recording)
     measured = apply_measured_height(recording, clouds)
@@ -202,15 +214,15 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     return measured
 
 
-def lost_labels(recording: Any) -> list[str]:
-    """Return a line that counts the labels whose scan is missing; none where all are there."""
+def describe_missing_scans(recording: Any) -> list[str]:
+    """Return a line with the number of labels whose scan is missing; no line if there are none."""
     lost = [reason for _, reason in recording.missing_scans]
     return [f"labels without a scan: {len(lost)}, such as {lost[0]}"] if lost else []
 
 
-def as_mounted(recording: Any, params: Any) -> Any:
-    """Return params with the sensor height of the recording, unless they set another than
-    KITTI's."""
+def with_recorded_height(recording: Any, params: Any) -> Any:
+    """Return params with the sensor height of the recording, unless they set a height other than
+    the default."""
     from lidar_perception.ground.params import set_sensor_height
     from lidar_perception.types import SENSOR_HEIGHT
     if params.ground.sensor_pose.height != SENSOR_HEIGHT:
@@ -219,12 +231,12 @@ def as_mounted(recording: Any, params: Any) -> Any:
 
 
 def write_json(path: Path | None, content: dict) -> None:
-    """Write the scores as JSON; nothing if path is None."""
+    """Write the scores as JSON, unless path is None."""
     if path is not None:
         write_text(path, json.dumps(content, indent=1))
 
 
-def no_labels(recording: Any, skipped: list[str], what: str = "labels") -> InputError:
-    """Return the error for a run that scored nothing, with the first reason."""
+def no_labels_error(recording: Any, skipped: list[str], what: str = "labels") -> InputError:
+    """Return the error for a run without scored frames, with the first reason."""
     reason = f" ({skipped[0]})" if skipped else ""
     return InputError(f"{recording.path}: no frame with {what}{reason}")

@@ -16,8 +16,8 @@ from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.classes import DETECTED
 from lidar_perception.cli.command import Choice, Command, refuse_given
-from lidar_perception.cli.data import WHAT, data_argument, opened, out_folder
-from lidar_perception.cli.evaluate.candidates import as_recorded
+from lidar_perception.cli.data import WHAT, data_argument, open_and_describe, out_folder
+from lidar_perception.cli.evaluate.candidates import with_recorded_setup
 from lidar_perception.cli.options import (
     CANDIDATES,
     Runs,
@@ -116,7 +116,7 @@ def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: i
     chosen = chosen_detector(detector, range, device, values,
                              PAPER if detector == CANDIDATES else None)
     require_rclpy()  # before the drive is made
-    recording = None if data is None else opened(data)
+    recording = None if data is None else open_and_describe(data)
     if recording is not None:
         recording.require(BOXES, "demo")
     _make_room(out, data, detector)
@@ -178,7 +178,7 @@ def _params_of(chosen: DetectorChoice, played: Recording) -> Any:
     """Return the parameters of the nodes, and compile their shared code once for all of them."""
     if chosen.weights == CANDIDATES:
         warm_up()
-        return as_recorded(played, checked(PAPER, chosen.settings))
+        return with_recorded_setup(played, checked(PAPER, chosen.settings))
     return chosen.open(sensor_height=played.frames[0].sensor_height).params
 
 

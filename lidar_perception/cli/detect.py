@@ -15,7 +15,7 @@ from lidar_perception.cli.data import (
     data_argument,
     jobs_option,
     limit_option,
-    opened,
+    open_and_describe,
     out_file,
     out_folder,
     split_option,
@@ -115,7 +115,7 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
         raise click.UsageError("--jobs is for this machine, --dask for others: give one of them")
     if not track and (ego != "auto" or tracking != TrackingParams()):
         raise click.UsageError("--ego and --set tracking.* are for --track")
-    recording = opened(data, split=split, sensor_height=mount_height or None)
+    recording = open_and_describe(data, split=split, sensor_height=mount_height or None)
     if track and not recording.is_sequential:
         raise InputError(f"{data} ({recording.layout}) has frames that do not follow each other, "
                          "so nothing can be tracked; leave out --track")

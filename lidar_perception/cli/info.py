@@ -10,7 +10,7 @@ import click
 from rich.table import Table
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import data_argument, lost_labels
+from lidar_perception.cli.data import data_argument, describe_missing_scans
 from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import describe_formats, find_layout, open_recording
@@ -86,7 +86,7 @@ def _recording(path: Path) -> dict[str, Any]:
             "greatest_intensity": None if scan.intensity is None else
             float(scan.intensity.max(initial=0)),
             "labels": None if truth is None else truth.labels},
-        "lost_labels": lost_labels(recording)}
+        "lost_labels": describe_missing_scans(recording)}
 
 
 def _print_recording(content: dict[str, Any]) -> None:

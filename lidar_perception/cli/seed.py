@@ -15,7 +15,12 @@ from lidar_perception.candidates.seed_sources import make_click_source, make_tru
 from lidar_perception.candidates.seeds import save_seed
 from lidar_perception.candidates.silhouette import to_pixels
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import as_mounted, data_argument, opened, out_file
+from lidar_perception.cli.data import (
+    data_argument,
+    open_and_describe,
+    out_file,
+    with_recorded_height,
+)
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.runs.terminal import console
@@ -43,8 +48,9 @@ def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, 
       lidar-perception seed /data/kitti/object --out pedestrian.json
       lidar-perception seed drive --frame 40 --at 18.0 8.6 -0.9 --out pedestrian.json
     """
-    recording = opened(data)
-    params, frame = as_mounted(recording, params), _pick(recording, number, params.view, at is None)
+    recording = open_and_describe(data)
+    params = with_recorded_height(recording, params)
+    frame = _pick(recording, number, params.view, at is None)
     camera = frame.camera()
     if camera is None:
         params = replace(params, view=ViewParams(enabled=False))

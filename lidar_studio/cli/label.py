@@ -14,7 +14,7 @@ from lidar_perception.cli.data import (
     browser_option,
     data_argument,
     json_option,
-    opened,
+    open_and_describe,
     out_folder,
     port_option,
     write_json,
@@ -69,7 +69,7 @@ def label(data: Path, sequence: str | None, out: Path | None, detector: Detector
 
     sources = [_split_format_and_path("--import", text) for text in imports]
     target = None if exports is None else _split_format_and_path("--export", exports)
-    recording = opened(data)
+    recording = open_and_describe(data)
     if simulate_annotator:
         write_json(json_file, _simulate_annotator(recording, sequence, detector))
         return

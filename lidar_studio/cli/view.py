@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from lidar_perception.cli.command import Choice, Command
-from lidar_perception.cli.data import browser_option, data_argument, opened, port_option
+from lidar_perception.cli.data import browser_option, data_argument, open_and_describe, port_option
 from lidar_perception.cli.options import detectors_options
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.runs.terminal import console, show_scanning
@@ -127,8 +127,11 @@ def _open_content(path: Path, detectors: tuple[DetectorChoice, ...], results: tu
 
     path, topic = split_topic(path)
     is_bag = path.exists() and is_layout(path)
-    recording = (opened(path, points=points or topic or result_sources.choose_points_topic(path))
-                 if is_bag else opened(path))
+    if is_bag:
+        points = points or topic or result_sources.choose_points_topic(path)
+        recording = open_and_describe(path, points=points)
+    else:
+        recording = open_and_describe(path)
     with show_scanning(path):
         drive = select_drive(recording, sequence)
     require_clouds(drive)

@@ -21,7 +21,7 @@ from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.cli import info
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import opened
+from lidar_perception.cli.data import open_and_describe
 from lidar_perception.cli.demo import _as_replayed, _params_of
 from lidar_perception.cli.main import COMMANDS, cli
 from lidar_perception.cli.options import detector_options, read_config
@@ -614,7 +614,7 @@ def test_without_rclpy_the_remedy_is_said_before_any_work(command, tmp_path):
 def test_demo_tells_its_nodes_how_high_the_sensor_is(tmp_path):
     """As measured in the bag that it replays, which says nothing of it."""
     write_bag(tmp_path / "bag", [lowered_crowd(i, 1.0) for i in range(3)])
-    recording = opened(tmp_path / "bag")
+    recording = open_and_describe(tmp_path / "bag")
     played = _as_replayed(recording.path, recording)
     pose = _params_of(DetectorChoice("candidates"), played).ground.sensor_pose
     assert pose.height == pytest.approx(0.7, abs=0.02)

@@ -19,7 +19,7 @@ from recording_samples import (
 )
 from samples import STAMP, object_folder, scene, write
 
-from lidar_perception.cli.data import opened
+from lidar_perception.cli.data import open_and_describe
 from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, POSES, Frame
 from lidar_perception.data.kitti.folder import GAP_NS, PERIOD_NS, read_velodyne
@@ -137,7 +137,7 @@ def test_commands_measure_an_unknown_sensor_height(tmp_path, height, expected):
                                  for i in range(4)])
     write(tmp_path / "files/0.bin", cloud.tobytes())
     for path in (tmp_path / "bag", tmp_path / "files"):
-        recording = opened(path)
+        recording = open_and_describe(path)
         for frames in (recording.frames, recording.reopen().frames):
             heights = [f.sensor_height for f in (*frames, frames[0], *frames[-1:])]
             assert heights == pytest.approx([expected] * len(heights), abs=0.02)

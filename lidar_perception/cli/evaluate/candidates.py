@@ -11,19 +11,25 @@ import click
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import Walk, as_mounted, no_labels, out_file, walk_options
+from lidar_perception.cli.data import (
+    ScoringOptions,
+    no_labels_error,
+    out_file,
+    scoring_options,
+    with_recorded_height,
+)
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.terminal import console, errors
 
 
-def as_recorded(recording: Any, params: PipelineParams) -> PipelineParams:
-    """Return params with the sensor height of the recording, see as_mounted.
+def with_recorded_setup(recording: Any, params: PipelineParams) -> PipelineParams:
+    """Return params with the sensor height of the recording, see with_recorded_height.
 
-    Without a camera the crop to its view is turned off, and a note is printed.
+    If the recording has no camera, the crop to its view is turned off and a note is printed.
     """
     from lidar_perception.data.frame import CAMERA
-    params = as_mounted(recording, params)
+    params = with_recorded_height(recording, params)
     if params.view.enabled and CAMERA not in recording.has:
         errors.print(f"{recording.path} has no camera calibration: the whole scan is processed")
         return with_values(params, {"view.enabled": False})
@@ -31,10 +37,10 @@ def as_recorded(recording: Any, params: PipelineParams) -> PipelineParams:
 
 
 @click.command(cls=Command)
-@walk_options()
+@scoring_options()
 @out_file("--png", "Draw the frame with most pedestrians from above.")
 @parameter_options(PAPER)
-def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
+def candidates(options: ScoringOptions, png: Path | None, params: PipelineParams) -> None:
     """Score the pedestrian candidates of the STM-CPA paper against Pedestrian labels.
 
     The paper's protocol unless --config or --set change it: frames with a pedestrian, points in the
@@ -49,17 +55,17 @@ def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
     from lidar_perception.scoring.centres.report import CandidateReport, measure_candidates
     from lidar_perception.scoring.centres.tables import print_candidate_report
 
-    recording = walk.opened(BOXES)
-    params = as_recorded(recording, params)
+    recording = options.open_recording(BOXES)
+    params = with_recorded_setup(recording, params)
     if params.seed.source == "click":
         raise click.UsageError("there is nobody to click here; use --set seed.source=file")
     report = CandidateReport()
-    walk.fill(report, recording, partial(measure_candidates, params))
+    options.fill(report, recording, partial(measure_candidates, params))
     if report.frames == 0:
-        raise no_labels(recording, report.skipped, "a Pedestrian label")
+        raise no_labels_error(recording, report.skipped, "a Pedestrian label")
     content = report.compute()
     print_candidate_report(content, console)
-    walk.write(content)
+    options.write(content)
     if png is not None:
         _draw(png, recording, report, params)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import Walk, a_path, no_labels, walk_options
+from lidar_perception.cli.data import ScoringOptions, a_path, no_labels_error, scoring_options
 from lidar_perception.cli.options import Runs, Settings, checked, settings_options
 from lidar_perception.detectors.open import POINTNET, default_params, resolve_weights
 from lidar_perception.detectors.pointnet.weights_file import WEIGHTS
@@ -34,11 +34,11 @@ def _runs(weights: Path | None) -> Runs:
 
 
 @click.command(cls=Command)
-@walk_options()
+@scoring_options()
 @a_path("--weights", "Checkpoint of a cluster network. Default: the one that comes with the "
         "package.")
 @settings_options(lambda given: [_runs(given.get("weights"))], "clustering.density=0")
-def clusters(walk: Walk, weights: Path | None, settings: Settings) -> None:
+def clusters(options: ScoringOptions, weights: Path | None, settings: Settings) -> None:
     """Score the classes that the cluster network (PointNet) assigns to clusters and points.
 
     Clusters are made as for its training, unless --config or --set change that. A cluster is an
@@ -60,10 +60,10 @@ def clusters(walk: Walk, weights: Path | None, settings: Settings) -> None:
     values, = settings.values(_runs(weights)) if settings else [{}]
     checked(default_params(file), values)
     scores = ClusterScores(read_header(file, PointNetConfig).config.classes)
-    recording = walk.opened(BOXES)
-    walk.fill(scores, recording, partial(measure_network, file, values))
+    recording = options.open_recording(BOXES)
+    options.fill(scores, recording, partial(measure_network, file, values))
     if not scores.frames:
-        raise no_labels(recording, scores.skipped)
+        raise no_labels_error(recording, scores.skipped)
     content = {"source": str(weights or "the package's own"), **scores.compute()}
     print_cluster_scores(content, console)
-    walk.write(content)
+    options.write(content)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 
 from lidar_perception.cli.command import Command, refuse_given
 from lidar_perception.cli.data import (
-    Walk,
+    ScoringOptions,
     a_path,
     intervals_option,
-    no_labels,
+    no_labels_error,
     out_folder,
-    walk_options,
+    scoring_options,
 )
 from lidar_perception.cli.options import detector_options
 from lidar_perception.detectors.open import DetectorChoice
@@ -24,8 +26,105 @@ from lidar_perception.runs.terminal import errors as terminal_errors
 from lidar_perception.types import InputError
 
 
+@dataclass(frozen=True)
+class DetectionRequest:
+    """A call of `evaluate detection`. The fields are its options; exactly one of `results` and
+    `detector` is not None."""
+
+    options: ScoringOptions
+    results: Path | None
+    detector: DetectorChoice | None
+    min_score: float
+    keep: float
+    mount_height: float
+    write_results: Path | None
+    errors: bool
+    errors_from: float
+    intervals: int
+
+    @property
+    def source(self) -> str:
+        """Origin of the boxes: a folder of result files, or weights."""
+        return str(self.results if self.detector is None else self.detector.weights)
+
+    def check(self) -> None:
+        """Raise a UsageError or InputError for options that do not go together."""
+        if not self.errors:
+            refuse_given(("errors_from",), "goes with --errors")
+        if self.detector is None:
+            refuse_given(("min_score", "device"), "is for a detector that runs; --results DIR has "
+                         "its boxes already")
+            if self.write_results is not None:
+                raise click.UsageError("--write-results writes the detections of a detector; "
+                                       "--results DIR has its files already")
+            if self.keep != 1:
+                raise click.UsageError("--keep thins the scans that a detector sees; --results DIR "
+                                       "sees none")
+        elif self.write_results is not None and self.write_results.is_dir() and any(
+                self.write_results.iterdir()):
+            raise InputError(f"{self.write_results} has files already; give another name")
+
+    def open_recording(self) -> Any:
+        """Open the recording. Labels are required unless detections are written."""
+        from lidar_perception.data.frame import BOXES, CAMERA
+        recording = self.options.open_recording(
+            BOXES if self.write_results is None else None, scans=self.detector is not None,
+            sensor_height=self.mount_height or None)
+        if self.results is not None and not self.results.is_dir():
+            raise InputError(f"{self.results} is not a folder; give the folder of the result files")
+        if self.detector is not None:
+            from lidar_perception.detectors.open import check_weights
+            for warning in check_weights(Path(self.detector.weights),
+                                         recording.frames[0].sensor_height):
+                terminal_errors.print(warning)
+        if CAMERA not in recording.has and (self.results or self.write_results) is not None:
+            terminal_errors.print(f"{recording.path} has no camera calibration: result files are "
+                                  "in the frame of a nominal camera, as detect writes them",
+                                  style="dim")
+        return recording
+
+    def make_start(self, recording: Any) -> Any:
+        """Return the function that scores a frame, see scoring.run.Start."""
+        from lidar_perception.scoring.detections import measure_detector, measure_result_files
+        if self.detector is None:
+            assert self.results is not None
+            return partial(measure_result_files, self.results)
+        open_detector = partial(self.detector.open, min_score=self.min_score,
+                                sensor_height=recording.frames[0].sensor_height)
+        return measure_detector(open_detector, self.keep, self.write_results)
+
+    def compute(self, report: Any) -> dict[str, Any]:
+        """Return the scores of a report as JSON."""
+        from lidar_perception.scoring.kitti.box_errors import measure_box_errors
+        from lidar_perception.scoring.kitti.protocol import SCORED, Comparison
+        from lidar_perception.scoring.kitti.reliability import measure_reliability
+        content = {"source": self.source, "keep": self.keep, **report.compute()}
+        if self.errors and report.frames:
+            comparison = Comparison.of(report.frames)
+            content["errors"] = {name: measure_box_errors(report.frames, name, self.errors_from)
+                                 for name in SCORED}
+            content["reliability"] = {name: measure_reliability(comparison, name)
+                                      for name in SCORED}
+        if self.intervals and report.frames:
+            content["intervals"] = report.intervals(self.intervals)
+        return content
+
+
+def _print(content: dict[str, Any]) -> None:
+    """Print the tables of the scores in `content`."""
+    from lidar_perception.scoring.kitti.box_errors import print_box_errors
+    from lidar_perception.scoring.kitti.reliability import print_reliability
+    from lidar_perception.scoring.kitti.tables import print_detection_report, print_intervals
+    print_detection_report(content, console)
+    if "errors" in content:
+        print_box_errors(content["errors"], console)
+        print_reliability(content["reliability"], console)
+    if "intervals" in content:
+        print_intervals(content["intervals"], console)
+
+
 @click.command(cls=Command)
-@walk_options()
+@scoring_options()
 @a_path("--results", "Result files of any detector, in KITTI's format: DIR/000000.txt ...; "
         "or the folder that `detect --format kitti` wrote.", "DIR")
 @detector_options()
@@ -46,9 +145,7 @@ from lidar_perception.types import InputError
 @click.option("--errors-from", type=click.FloatRange(0, 1), default=0.2, show_default=True,
               metavar="SCORE", help="With --errors: look at boxes from this score on.")
 @intervals_option
-def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None, min_score: float,
-              keep: float, mount_height: float, write_results: Path | None, errors: bool,
-              errors_from: float, intervals: int) -> None:
+def detection(options: ScoringOptions, **choices: Any) -> None:
     """Score boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
 
     Prints average precision of 2D, BEV and 3D boxes and of orientation at 40 and 11 recall points,
@@ -63,68 +160,17 @@ def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None,
           --split val.txt --json scores.json --write-results out/data
       lidar-perception evaluate detection drive --weights v4.safetensors --keep 0.1
     """
-    from lidar_perception.data.frame import BOXES, CAMERA
-    from lidar_perception.detectors.open import check_weights
-    from lidar_perception.scoring.detections import measure_detector, measure_result_files
-    from lidar_perception.scoring.kitti.box_errors import measure_box_errors, print_box_errors
-    from lidar_perception.scoring.kitti.protocol import SCORED, Comparison
-    from lidar_perception.scoring.kitti.reliability import measure_reliability, print_reliability
     from lidar_perception.scoring.kitti.report import DetectionReport
-    from lidar_perception.scoring.kitti.tables import print_detection_report, print_intervals
-    from lidar_perception.scoring.run import Start
-
-    if detector is None:
-        refuse_given(("min_score", "device"), "is for a detector that runs; --results DIR has its "
-                     "boxes already")
-    if not errors:
-        refuse_given(("errors_from",), "goes with --errors")
-    if write_results is not None and detector is None:
-        raise click.UsageError("--write-results writes the detections of a detector; --results DIR "
-                               "has its files already")
-    if write_results is not None and write_results.is_dir() and any(write_results.iterdir()):
-        raise InputError(f"{write_results} has files already; give another name")
-    if keep != 1 and detector is None:
-        raise click.UsageError("--keep thins the scans that a detector sees; --results DIR sees "
-                               "none")
-    recording = walk.opened(BOXES if write_results is None else None, scans=detector is not None,
-                            sensor_height=mount_height or None)
-    start: Start
-    if results is not None:
-        if not results.is_dir():
-            raise InputError(f"{results} is not a folder; give the folder of the result files")
-        start = partial(measure_result_files, results)
-    else:
-        assert detector is not None  # as there are no --results
-        height = recording.frames[0].sensor_height
-        for doubt in check_weights(Path(detector.weights), height):
-            terminal_errors.print(doubt)
-        start = measure_detector(
-            partial(detector.open, min_score=min_score, sensor_height=height), keep, write_results
-        )
-    if CAMERA not in recording.has and (results is not None or write_results is not None):
-        terminal_errors.print(f"{recording.path} has no camera calibration: result files are in "
-                              "the frame of a nominal camera, as detect writes them", style="dim")
+    request = DetectionRequest(options, **choices)
+    request.check()
+    recording = request.open_recording()
     report = DetectionReport(follow=recording.is_sequential)
-    walk.fill(report, recording, start)
-    if write_results is not None:
-        console.print(f"result files: {write_results}")
-    if not report.frames and (write_results is None or report.skipped):
-        raise no_labels(recording, report.skipped)
-    content = {"source": str(results if detector is None else detector.weights), "keep": keep,
-               **report.compute()}
-    if errors and report.frames:
-        concatenate = Comparison.of(report.frames)
-        content["errors"] = {
-            name: measure_box_errors(report.frames, name, errors_from) for name in SCORED
-        }
-        content["reliability"] = {name: measure_reliability(concatenate, name) for name in SCORED}
-    if intervals and report.frames:
-        content["intervals"] = report.intervals(intervals)
+    options.fill(report, recording, request.make_start(recording))
+    if request.write_results is not None:
+        console.print(f"result files: {request.write_results}")
+    if not report.frames and (request.write_results is None or report.skipped):
+        raise no_labels_error(recording, report.skipped)
+    content = request.compute(report)
     if report.frames:
-        print_detection_report(content, console)
-        if errors:
-            print_box_errors(content["errors"], console)
-            print_reliability(content["reliability"], console)
-        if intervals:
-            print_intervals(content["intervals"], console)
-    walk.write(content)
+        _print(content)
+    options.write(content)

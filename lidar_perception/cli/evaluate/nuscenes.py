@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import Walk, a_path, no_labels, out_file, walk_options
+from lidar_perception.cli.data import (
+    ScoringOptions,
+    a_path,
+    no_labels_error,
+    out_file,
+    scoring_options,
+)
 from lidar_perception.cli.options import detector_options
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.detectors.params import MIN_SCORE
@@ -16,15 +24,57 @@ from lidar_perception.runs.terminal import console
 from lidar_perception.types import InputError
 
 
+@dataclass(frozen=True)
+class NuscenesRequest:
+    """A call of `evaluate nuscenes`. The fields are its options; exactly one of `results` and
+    `detector` is not None."""
+
+    options: ScoringOptions
+    results: Path | None
+    detector: DetectorChoice | None
+    write_results: Path | None
+
+    @property
+    def source(self) -> str:
+        """Origin of the boxes: a result file, or weights."""
+        return str(self.results if self.detector is None else self.detector.weights)
+
+    def check(self) -> None:
+        """Raise a UsageError for options that do not go together."""
+        if (self.results is None) == (self.detector is None):
+            raise click.UsageError("give either --results JSON or --weights FILE")
+        if self.write_results is not None and self.detector is None:
+            raise click.UsageError("--write-results writes the detections of --weights; --results "
+                                   "JSON is such a file already")
+
+    def open_recording(self) -> Any:
+        """Open the recording, which must be nuScenes."""
+        from lidar_perception.data.nuscenes.folder import KeyFrame
+        recording = self.options.open_recording(None)
+        if not isinstance(recording.frames[0].native, KeyFrame):
+            raise InputError(f"{self.options.data} ({recording.layout}) is not nuScenes; use "
+                             "evaluate detection")
+        return recording
+
+    def make_start(self, recording: Any) -> Any:
+        """Return the function that scores a frame, see scoring.run.Start."""
+        from lidar_perception.scoring.nuscenes.report import measure_key_frames, measure_result_file
+        if self.detector is None:
+            assert self.results is not None
+            return partial(measure_result_file, self.results)
+        open_detector = partial(self.detector.open, min_score=MIN_SCORE,
+                                sensor_height=recording.frames[0].sensor_height)
+        return partial(measure_key_frames, open_detector, self.write_results is not None)
+
+
 @click.command(cls=Command)
-@walk_options()
+@scoring_options()
 @a_path("--results", "Result file of any detector, in the format of nuScenes' detection task.",
         "JSON")
 @detector_options(default=None)
 @out_file("--write-results", "Write the detections of --weights as a result file, also for frames "
                              "without labels.")
-def nuscenes(walk: Walk, results: Path | None, detector: DetectorChoice | None,
-             write_results: Path | None) -> None:
+def nuscenes(options: ScoringOptions, **choices: Any) -> None:
     """Score boxes by the protocol of nuScenes' detection task.
 
     Average precision by centre distance at 0.5, 1, 2 and 4 m, the five errors of true positives and
@@ -38,40 +88,21 @@ def nuscenes(walk: Walk, results: Path | None, detector: DetectorChoice | None,
       lidar-perception evaluate nuscenes /data/nuscenes/v1.0-trainval \\
           --split val.txt --weights v4.safetensors --json scores.json
     """
-    from lidar_perception.data.nuscenes.folder import KeyFrame
-    from lidar_perception.data.nuscenes.results import write_results as write_result_file
-    from lidar_perception.scoring.nuscenes.report import (
-        NuscenesReport,
-        measure_key_frames,
-        measure_result_file,
-    )
+    from lidar_perception.data.nuscenes.results import write_results
+    from lidar_perception.scoring.nuscenes.report import NuscenesReport
     from lidar_perception.scoring.nuscenes.tables import print_nuscenes_report
-
-    if (results is None) == (detector is None):
-        raise click.UsageError("give either --results JSON or --weights FILE")
-    if write_results is not None and detector is None:
-        raise click.UsageError("--write-results writes the detections of --weights; --results "
-                               "JSON is such a file already")
-    recording = walk.opened(None)
-    first = recording.frames[0]
-    if not isinstance(first.native, KeyFrame):
-        raise InputError(f"{walk.data} ({recording.layout}) is not nuScenes; use evaluate "
-                         "detection")
-    if results is not None:
-        start = partial(measure_result_file, results)
-    else:
-        assert detector is not None  # as there are no --results
-        open_ = partial(detector.open, min_score=MIN_SCORE, sensor_height=first.sensor_height)
-        start = partial(measure_key_frames, open_, write_results is not None)
+    request = NuscenesRequest(options, **choices)
+    request.check()
+    recording = request.open_recording()
     report = NuscenesReport()
-    walk.fill(report, recording, start)
-    if write_results is not None:
-        write_result_file(write_results, report.boxes)
-        console.print(f"result file: {write_results}")
-    if not report.frames and (write_results is None or report.skipped):
-        raise no_labels(recording, report.skipped)
-    content = {"source": str(results if detector is None else detector.weights),
-               "version": recording.layout.split()[-1], **report.compute()}
+    options.fill(report, recording, request.make_start(recording))
+    if request.write_results is not None:
+        write_results(request.write_results, report.boxes)
+        console.print(f"result file: {request.write_results}")
+    if not report.frames and (request.write_results is None or report.skipped):
+        raise no_labels_error(recording, report.skipped)
+    content = {"source": request.source, "version": recording.layout.split()[-1],
+               **report.compute()}
     if report.frames:
         print_nuscenes_report(content, console)
-    walk.write(content)
+    options.write(content)

@@ -12,12 +12,12 @@ import click
 from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import (
     WHAT,
-    Walk,
-    as_mounted,
+    ScoringOptions,
     data_argument,
-    no_labels,
+    no_labels_error,
     out_file,
-    walk_options,
+    scoring_options,
+    with_recorded_height,
 )
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.clustering.params import CLUSTERING_METHODS
@@ -42,7 +42,7 @@ class MethodList(click.ParamType):
 
 
 @click.command(cls=Command)
-@walk_options(data_argument(f"{WHAT} May be repeated.", several=True))
+@scoring_options(data_argument(f"{WHAT} May be repeated.", several=True))
 @click.option("--methods", type=MethodList(), default=GROUND_METHODS + CLUSTERING_METHODS,
               help="Methods to score, of ground and of clustering, with commas between. "
               "Default: all.")
@@ -50,7 +50,8 @@ class MethodList(click.ParamType):
 @parameter_options(SegmentationParams(), "segmentation",
                    ("perception", "ground_segmentation", "clustering"),
                    "ground.method=patchwork")
-def segmentation(walk: Walk, methods: tuple, png: Path | None, params: SegmentationParams) -> None:
+def segmentation(options: ScoringOptions, methods: tuple, png: Path | None,
+                 params: SegmentationParams) -> None:
     """Score ground and clusters against labels.
 
     Ground: each method against the classes of SemanticKITTI's points. Clusters: each method, on
@@ -70,9 +71,9 @@ def segmentation(walk: Walk, methods: tuple, png: Path | None, params: Segmentat
 
     grounds = tuple(name for name in GROUND_METHODS if name in methods)
     clusterings = tuple(name for name in CLUSTERING_METHODS if name in methods)
-    # Everything is opened first: a typing error in the last path should not cost an hour.
-    recordings = [walk.opened(None, path) for path in walk.data]
-    labelled = [each for each in recordings if POINT_LABELS in each.has]
+    # Open everything first: a typing error in the last path should not cost an hour.
+    recordings = [options.open_recording(None, path) for path in options.data]
+    labelled = [recording for recording in recordings if POINT_LABELS in recording.has]
     for recording in recordings:
         if recording not in labelled:
             recording.require(BOXES, "evaluate segmentation")
@@ -85,21 +86,21 @@ def segmentation(walk: Walk, methods: tuple, png: Path | None, params: Segmentat
     report = SegmentationReport()
     for recording in recordings:
         report.source = recording.layout
-        own = as_mounted(recording, params)
-        walk.fill(report, recording, partial(measure_methods, own, grounds, clusterings),
-                  recording.layout)
+        own = with_recorded_height(recording, params)
+        options.fill(report, recording, partial(measure_methods, own, grounds, clusterings),
+                     recording.layout)
     if not (report.ground or report.clusters):
-        raise no_labels(recordings[0], report.skipped)
+        raise no_labels_error(recordings[0], report.skipped)
     content = report.compute()
     if report.whole:
-        errors.print(f"{', '.join(map(str, walk.data))}: {report.whole} frames "
-                     "without a camera calibration were taken as a whole")
+        errors.print(f"{', '.join(map(str, options.data))}: {report.whole} frames "
+                     "without a camera calibration were scored as a whole")
     print_scores(content, params.ground.method, console)
-    walk.write(content)
+    options.write(content)
     if png is not None:
         from lidar_perception.scoring.points.report import segment_by_methods
-        own = as_mounted(labelled[0], params)
-        for frame in islice(labelled[0], walk.limit):
+        own = with_recorded_height(labelled[0], params)
+        for frame in islice(labelled[0], options.limit):
             scan, labels, found = segment_by_methods(frame, own, grounds)
             if labels is not None:
                 draw_ground(png, frame.name, scan, labels.classes, found)
