@@ -1,4 +1,5 @@
-"""How fast the page is: python page/measure.py URL, with the address that label or view printed.
+"""Measure the speed of the page: python page/measure.py URL, with the address that label or view
+printed.
 
 Needs playwright (pip install playwright) and chromium; draws in software, as without a GPU.
 """
@@ -91,8 +92,8 @@ NEXT = """async (count) => {
 }"""
 
 
-def processes() -> dict[int, str]:
-    """Those of all browsers: what each is for."""
+def list_processes() -> dict[int, str]:
+    """Return the kind of each browser process by its id: "renderer", "gpu-process" or ""."""
     found = {}
     for folder in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -103,74 +104,74 @@ def processes() -> dict[int, str]:
     return found
 
 
-def cpu_ms(pid: int) -> float:
-    """That a process has used."""
+def read_cpu_ms(pid: int) -> float:
+    """Return the CPU time of a process in milliseconds."""
     rows = (Path("/proc") / str(pid) / "stat").read_text().rsplit(")", 1)[1].split()
     return 1e3 * (int(rows[11]) + int(rows[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def memory(pid: int) -> int:
-    """Of a process, bytes (proportional set size)."""
+def read_memory(pid: int) -> int:
+    """Return the proportional set size of a process in bytes."""
     lines = (Path("/proc") / str(pid) / "smaps_rollup").read_text().splitlines()
     return int(next(x for x in lines if x.startswith("Pss:")).split()[1]) * 1024
 
 
-class Measured:
-    """A page, with the processes of its browser."""
+class MeasuredPage:
+    """A page and the processes of its browser."""
 
     def __init__(self, page: Page, others: set[int]) -> None:
         self.page = page
-        mine = {pid: kind for pid, kind in processes().items() if pid not in others}
-        self.page_pid = max((p for p, kind in mine.items() if kind == "renderer"), key=memory)
+        own = {pid: kind for pid, kind in list_processes().items() if pid not in others}
+        self.page_pid = max((p for p, kind in own.items() if kind == "renderer"), key=read_memory)
         self.pids = {"page": self.page_pid,
-                     "drawing": next(p for p, kind in mine.items() if kind == "gpu-process")}
+                     "drawing": next(p for p, kind in own.items() if kind == "gpu-process")}
 
-    def say(self, what: str, script: str, arguments: object) -> None:
-        """Run a script that gives the times of what it has done; print these, and the CPU time of
-        the page's processes for each."""
-        before = {name: cpu_ms(pid) for name, pid in self.pids.items()}
-        measured = self.page.evaluate(script, arguments)
-        took, count = sorted(measured["took"]), len(measured["took"])
-        cpu = ", ".join(f"{name} {(cpu_ms(pid) - before[name]) / count:.1f}"
+    def measure(self, title: str, script: str, arguments: object) -> None:
+        """Run a script that returns durations, and print them with the mean CPU time of the page's
+        processes."""
+        before = {name: read_cpu_ms(pid) for name, pid in self.pids.items()}
+        result = self.page.evaluate(script, arguments)
+        took, count = sorted(result["took"]), len(result["took"])
+        cpu = ", ".join(f"{name} {(read_cpu_ms(pid) - before[name]) / count:.1f}"
                         for name, pid in self.pids.items())
-        print(f"{what}, {measured['points']:,} points: median {statistics.median(took):.1f} ms, "
-              f"slowest of {count} {took[-1]:.1f} ms; CPU each, ms: {cpu}", flush=True)
+        print(f"{title}, {result['points']:,} points: median {statistics.median(took):.1f} ms, "
+              f"slowest of {count} {took[-1]:.1f} ms; mean CPU time in ms: {cpu}", flush=True)
 
-    def walk(self) -> None:
-        """Play to the last frame; print what that took, and the memory."""
-        page, most = self.page, 0
+    def measure_playback(self) -> None:
+        """Play to the last frame, and print the duration and the memory."""
+        page, max_memory = self.page, 0
         first, start = page.evaluate("page.store.frame"), monotonic()
         last = page.evaluate("page.store.drive.frames.length - 1")
         page.locator("#scene").focus()
         page.keyboard.press(" ")
         while page.evaluate("page.store.frame") < last:
             page.wait_for_timeout(1000)
-            most = max(most, memory(self.page_pid))
-        each = 1e3 * (monotonic() - start) / max(last - first, 1)
+            max_memory = max(max_memory, read_memory(self.page_pid))
+        mean = 1e3 * (monotonic() - start) / max(last - first, 1)
         page.wait_for_timeout(2000)
-        print(f"played {last - first} frames, {each:.0f} ms each; memory of the page at most "
-              f"{most / 1e6:.0f} MB, at the end {memory(self.page_pid) / 1e6:.0f} MB")
+        print(f"played {last - first} frames, {mean:.0f} ms each; memory of the page at most "
+              f"{max_memory / 1e6:.0f} MB, at the end {read_memory(self.page_pid) / 1e6:.0f} MB")
 
 
 def main() -> None:
-    others = set(processes())
+    others = set(list_processes())
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
         page = browser.new_page(viewport={"width": 1280, "height": 720})
         page.goto(sys.argv[1])
         page.wait_for_selector("html[data-ready=true]", state="attached")
         page.wait_for_timeout(2000)
-        measured = Measured(page, others)
-        measured.say("picture while the view moves", PICTURES, [40, 30_000])
-        measured.say("picture of all points", PICTURES, [20, 10**9])
-        measured.say("picture while the view stands still", STANDING, 40)
-        measured.say("pick", PICKS, 50)
+        measured = MeasuredPage(page, others)
+        measured.measure("drawing while the camera moves", PICTURES, [40, 30_000])
+        measured.measure("drawing all points", PICTURES, [20, 10**9])
+        measured.measure("drawing while the camera stands still", STANDING, 40)
+        measured.measure("pick", PICKS, 50)
         page.locator("#scene").focus()
         page.keyboard.press("s")
-        measured.say("cluster under the pointer shown", HOVER, 25)
+        measured.measure("highlighting the cluster under the pointer", HOVER, 25)
         page.keyboard.press("Escape")
-        measured.say("next frame", NEXT, 12)
-        measured.walk()
+        measured.measure("next frame", NEXT, 12)
+        measured.measure_playback()
         browser.close()
 
 

@@ -1,4 +1,4 @@
-"""A browser, and the page of label in it."""
+"""Fixtures: a browser, and the page of label in it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import socket
 
 import pytest
 from browsing import browsing
-from labeling_pages import Label, labelled_person, opened, serving
+from labeling_pages import Label, find_nearest_person, opened, serving
 
 from lidar_perception.data.open import open_recording
 
@@ -25,8 +25,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def labels(drive_bag, tmp_path_factory):
-    """The labelling of a drive, at the address that stays the same when its server is started
-    again."""
+    """A running label server, on a port that stays the same after a restart."""
     out, port = tmp_path_factory.mktemp("labels"), free_port()
     arguments = ("label", "--data", str(drive_bag), "--out", str(out), "--no-open", "--no-propose",
                  "--port", str(port))
@@ -42,8 +41,7 @@ def first_page(browser, labels):
 
 @pytest.fixture
 def page(first_page):
-    """A page on the first frame, in which nothing is selected: the same for all tests, as an
-    annotator's stays open."""
+    """The shared page, on the first frame and without a selection."""
     first_page.keyboard.press("Escape")
     first_page.keyboard.press("Escape")
     first_page.keyboard.press("Home")
@@ -53,4 +51,4 @@ def page(first_page):
 @pytest.fixture(scope="module")
 def person(drive_bag):
     """(7,) the box of a labelled person near the sensor in the first frame."""
-    return labelled_person(next(iter(open_recording(drive_bag))))
+    return find_nearest_person(next(iter(open_recording(drive_bag))))

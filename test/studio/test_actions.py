@@ -1,4 +1,4 @@
-"""What a person does to the labels: replayed, undone, carried from frame to frame."""
+"""Actions of a labelling session: replay, undo, interpolation between frames."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SIZE = [0.8, 0.6, 1.7]
 
 
 def poses(turn=0.05, speed=8.0):
-    """Of a sensor that drives a bend."""
+    """Poses of a sensor on a curve."""
     found = np.tile(np.eye(4), (FRAMES, 1, 1))
     for i, t in enumerate(STAMPS / 1e9):
         cos, sin = math.cos(turn * i), math.sin(turn * i)
@@ -70,7 +70,7 @@ ACTIONS = st.one_of(
 
 
 def done(actions, motion, state=State()):
-    """The state after those that can be done, and these."""
+    """Return the state after all valid actions, and these actions."""
     lines = []
     for action in actions:
         try:
@@ -82,19 +82,19 @@ def done(actions, motion, state=State()):
 
 
 def labels(state):
-    """All that a person sees."""
+    """Return the part of the state that the page shows."""
     return dict(state.tracks), state.seeds, state.checked
 
 
 def close(a, b, tolerance=1e-9):
-    """Whether two boxes are one."""
+    """Return True if two boxes are equal up to a tolerance."""
     apart = np.array(a) - np.array(b)
     apart[6] = wrap_angle(apart[6])
     return bool((np.abs(apart) <= tolerance).all())
 
 
 @given(st.lists(ACTIONS, max_size=30), st.sampled_from([STANDING, DRIVING]))
-def test_the_lines_replayed_give_the_same_state(actions, motion):
+def test_replaying_the_lines_gives_the_same_state(actions, motion):
     state, lines = done(actions, motion)
     again, _ = done(json.loads(json.dumps(lines)), motion)
     assert again == state
@@ -106,7 +106,7 @@ def test_the_lines_replayed_give_the_same_state(actions, motion):
 
 
 @given(st.lists(ACTIONS, max_size=25), st.sampled_from([STANDING, DRIVING]))
-def test_undo_and_redo_are_inverses_without_end(actions, motion):
+def test_undo_and_redo_are_inverses_at_any_depth(actions, motion):
     end, _ = done(actions, motion)
     seen, state = [labels(end)], end
     while state.undo_stack is not None:
@@ -120,7 +120,7 @@ def test_undo_and_redo_are_inverses_without_end(actions, motion):
 
 
 @given(ACTIONS, st.lists(ACTIONS, max_size=8))
-def test_an_action_that_cannot_be_done_changes_nothing(action, before):
+def test_invalid_action_changes_nothing(action, before):
     state, _ = done(before, DRIVING)
     kept = labels(state), state.seq
     try:
@@ -143,14 +143,14 @@ def test_an_action_that_cannot_be_done_changes_nothing(action, before):
     {"do": "merge", "tracks": [1, 1]}, {"do": "merge", "tracks": [1]}, {"do": "undo"},
     {"do": "check", "frame": 0, "checked": 1}, {"do": "seed", "frame": 0, "xyz": [0, 0, 0],
                                                 "class": "Car"}], ids=str)
-def test_what_is_no_action_is_refused_in_one_line(wrong):
+def test_invalid_action_is_refused_in_one_line(wrong):
     with pytest.raises(InputError) as error:
         apply(State(), wrong, STANDING)
     assert "\n" not in str(error.value)
 
 
 def walking(start, velocity, motion, kind=KEY):
-    """A box that moves evenly in the fixed frame, by frame."""
+    """Boxes by frame of an object with constant velocity in the fixed frame."""
     found = {}
     for f, t in enumerate(motion.times):
         fixed = np.array([start[0] + velocity[0] * t, start[1] + velocity[1] * t, -0.9, *SIZE,
@@ -163,7 +163,7 @@ def walking(start, velocity, motion, kind=KEY):
 
 @given(st.tuples(metres, metres), st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
        st.sampled_from([STANDING, DRIVING]), st.sets(frames, min_size=2), st.randoms())
-def test_between_key_boxes_constant_motion_is_exact_in_whatever_order_they_are_set(
+def test_constant_motion_is_exact_between_key_boxes_in_any_order(
         start, velocity, motion, keys, random):
     true = walking(start, velocity, motion)
     order = sorted(keys)
@@ -183,9 +183,7 @@ def test_between_key_boxes_constant_motion_is_exact_in_whatever_order_they_are_s
 
 @given(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), st.floats(-1.5, 1.5), frames,
        st.sampled_from([STANDING, DRIVING]))
-def test_a_correction_moves_the_whole_track_that_nobody_has_touched(shift, turn, frame, motion):
-    """A proposed track that is off by the same in the fixed frame everywhere is right everywhere
-    after one correction."""
+def test_correction_moves_a_whole_track_without_key_boxes(shift, turn, frame, motion):
     true = walking((5.0, 3.0), (1.0, 0.5), motion, PROPOSED)
     off = {}
     for f, box in true.items():
@@ -198,7 +196,7 @@ def test_a_correction_moves_the_whole_track_that_nobody_has_touched(shift, turn,
         assert close(box.values, true[f].values, 1e-7)
 
 
-def test_a_correction_ends_at_the_next_key_box():
+def test_correction_ends_at_the_next_key_box():
     true = walking((5.0, 3.0), (1.0, 0.0), STANDING, PROPOSED)
     true[3] = replace_kind(true[3])
     state = State({1: Track(1, "Pedestrian", boxes=true)}, next_id=2)
@@ -211,11 +209,10 @@ def test_a_correction_ends_at_the_next_key_box():
 
 
 def replace_kind(box):
-    """The same as a key box."""
     return Box(box.values, KEY)
 
 
-def test_a_frame_that_a_person_emptied_stays_empty():
+def test_frame_emptied_by_a_person_stays_empty():
     true = walking((5.0, 3.0), (1.0, 0.0), STANDING, PROPOSED)
     state = State({1: Track(1, "Pedestrian", boxes=true)}, next_id=2)
     state, _ = done([{"do": "remove_box", "track": 1, "frame": 3},
@@ -244,7 +241,7 @@ def test_split_and_merge_are_inverses(there, cut):
     assert again.tracks[3] == replace(parts.tracks[2], id=3)
 
 
-def test_trimming_keeps_what_splitting_there_would_keep():
+def test_trim_keeps_the_same_boxes_as_split():
     true = walking((5.0, 3.0), (1.0, 0.5), DRIVING, PROPOSED)
     state = State({1: Track(1, "Pedestrian", boxes=true)}, seeds=((2, 1), (6, 1)), next_id=2)
     early, _ = apply(state, {"do": "trim", "track": 1, "frame": 3, "side": "after"}, DRIVING)
@@ -258,7 +255,7 @@ def test_trimming_keeps_what_splitting_there_would_keep():
             apply(state, {"do": "trim", "track": 1, "frame": frame, "side": side}, DRIVING)
 
 
-def test_copying_there_and_back_is_the_identity_and_a_copy_stands_still_in_the_world():
+def test_copied_box_stands_still_in_the_fixed_frame():
     box = [12.0, -3.0, -0.9, *SIZE, 0.4]
     state, _ = done([{"do": "add", "frame": 1, "box": box, "class": "Car"},
                      {"do": "copy", "track": 1, "from": 1, "to": 6},
@@ -269,7 +266,7 @@ def test_copying_there_and_back_is_the_identity_and_a_copy_stands_still_in_the_w
                for f, b in found.items())
 
 
-def test_the_next_uncertain_one_goes_round():
+def test_next_uncertain_wraps_around():
     def track(number, score, **more):
         return Track(number, "Car", score=score, boxes={0: Box((9.0,) * 7, PROPOSED)}, **more)
     state = State({t.id: t for t in (track(1, 0.9), track(2, 0.45), track(3, 0.55),
@@ -279,7 +276,7 @@ def test_the_next_uncertain_one_goes_round():
     assert find_next_uncertain(State()) is None
 
 
-def test_the_rest_of_a_class_is_rejected_at_once_and_comes_back_at_once():
+def test_rest_of_a_class_is_rejected_and_restored_as_one_action():
     def track(number, name, **more):
         return Track(number, name, boxes={0: Box((9.0,) * 7, PROPOSED)}, **more)
     state = State({t.id: t for t in (track(1, "Car"), track(2, "Van"), track(3, "Car"),
@@ -296,7 +293,7 @@ def test_the_rest_of_a_class_is_rejected_at_once_and_comes_back_at_once():
 
 
 @given(st.lists(ACTIONS, max_size=6), ACTIONS)
-def test_what_joins_the_last_action_is_undone_with_it(before, action):
+def test_joined_action_is_undone_with_the_previous_one(before, action):
     state, _ = done([*before, {"do": "add", "frame": 1, "box": [5, 0, 0, *SIZE, 0],
                                "class": "Van"}], DRIVING)
     below = state.undo_stack[1]
@@ -311,8 +308,8 @@ def test_what_joins_the_last_action_is_undone_with_it(before, action):
     assert labels(again) == labels(both)
 
 
-def test_every_action_is_tried():
-    tried = {"seed", "propose", "import"}  # with what is computed for them: test_label_server.py
+def test_every_action_is_tested():
+    tried = {"seed", "propose", "import"}  # tested in test_label_server.py
     named = {"add", "box", "snap", "size", "remove_box", "split", "interpolate", "copy", "merge",
              "accept", "reject", "reject_rest", "trim", "reopen", "class", "check"}
     assert tried | named == HANDLERS.keys()

@@ -1,4 +1,4 @@
-"""A drive to be labelled: its clouds, and which of several it is; sizes and headings of boxes."""
+"""Drives to label, the cache of scans, and sizes and headings of boxes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lidar_studio.drive import Scan, ScanCache, select_drive
 from lidar_studio.snap import align_heading, fit_clicked_box, resize_box
 
 
-def test_clouds_keep_to_their_bound_and_are_made_once():
+def test_scan_cache_is_bounded_and_makes_a_scan_once():
     made = []
 
     def make(i):
@@ -37,7 +37,7 @@ def test_clouds_keep_to_their_bound_and_are_made_once():
     assert len(clouds._making) <= 6
 
 
-def test_a_recording_of_several_drives_wants_one_named():
+def test_recording_of_several_drives_needs_a_sequence():
     frames = [*simulate_frames(119, 2, streets_of=1)]
     recording = Recording(Path("two"), "simulated", frames)
     with pytest.raises(InputError, match="--sequence"):
@@ -47,7 +47,7 @@ def test_a_recording_of_several_drives_wants_one_named():
         select_drive(recording, "7")
 
 
-def test_another_size_leaves_the_corner_that_is_seen():
+def test_resized_box_keeps_the_visible_corner():
     rng = np.random.default_rng(0)
     for _ in range(50):
         box = np.array([*rng.uniform(8, 20, 2) * rng.choice([-1, 1], 2), 0, *rng.uniform(1, 4, 3),
@@ -63,15 +63,14 @@ def test_another_size_leaves_the_corner_that_is_seen():
         assert resize_box(other, box[3:6]) == pytest.approx(box) or abs(seen) <= 4
 
 
-def test_a_box_has_four_ways_to_say_it():
+def test_aligned_heading_is_the_same_box():
     box = np.array([1.0, 2, 3, 4, 2, 1, 0.3])
     for turn in range(-4, 5):
         again = align_heading(align_heading(box, 0.3 + turn * np.pi / 2), 0.35)
         assert again == pytest.approx(box)
 
 
-def test_a_click_beside_a_wall_gives_a_box_of_its_nearest_part():
-    """It is too long for a person, and farther from the click than a person is long."""
+def test_click_next_to_a_wall_boxes_its_nearest_part():
     y, z = np.meshgrid(np.arange(-4, 4, 0.1), np.arange(-1.5, 0.5, 0.1))
     xyz = np.stack([np.full(y.size, 9.0), y.ravel(), z.ravel()], 1).astype(np.float32)
     scan = Scan(xyz, np.zeros(len(xyz), np.uint8), np.zeros(len(xyz), bool),

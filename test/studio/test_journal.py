@@ -1,4 +1,4 @@
-"""The journal: what a kill, a full disk and a wrong drive do to it."""
+"""The journal file: killed processes, full disks, other drives."""
 
 from __future__ import annotations
 
@@ -17,26 +17,25 @@ HEAD = make_journal_header("drive", ["a", "b c"], [1, 2])
 
 
 def lines(count):
-    """Actions."""
     return [{"seq": i, "do": "check", "frame": i, "checked": True} for i in range(1, count + 1)]
 
 
 def filled(folder, count):
-    """A journal with so many actions; its bytes."""
+    """Write a journal with `count` actions and return its bytes."""
     with open_journal(folder, HEAD) as journal:
         for line in lines(count):
             journal.append(line)
     return (folder / JOURNAL_NAME).read_bytes()
 
 
-def test_what_was_appended_is_there(tmp_path):
+def test_appended_lines_are_read_back(tmp_path):
     content = filled(tmp_path, 3)
     with open_journal(tmp_path, HEAD) as journal:
         assert journal.lines == lines(3) and journal.message is None
     assert (tmp_path / JOURNAL_NAME).read_bytes() == content
 
 
-def test_a_torn_last_line_is_cut_off_wherever_it_ends(tmp_path):
+def test_torn_last_line_is_cut_off_at_any_byte(tmp_path):
     content = filled(tmp_path, 2)
     first = content.index(b"\n") + 1
     for size in range(len(content)):
@@ -62,7 +61,7 @@ with open_journal(Path(sys.argv[1]), make_journal_header("drive", ["a", "b c"], 
 """
 
 
-def test_a_kill_in_the_middle_of_writing_loses_nothing_that_was_said_to_be_done(tmp_path):
+def test_kill_while_writing_loses_no_confirmed_action(tmp_path):
     for stop in (1, 20, 37):
         folder = tmp_path / str(stop)
         with subprocess.Popen([sys.executable, "-c", WRITER, str(folder)], text=True,
@@ -78,7 +77,7 @@ def test_a_kill_in_the_middle_of_writing_loses_nothing_that_was_said_to_be_done(
                 1, len(journal.lines) + 1))
 
 
-def test_a_second_process_is_refused_and_a_killed_one_holds_nothing(tmp_path):
+def test_second_process_is_refused_until_the_first_is_killed(tmp_path):
     with subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], text=True,
                           stdout=subprocess.PIPE) as process:
         process.stdout.readline()
@@ -94,7 +93,7 @@ def test_a_second_process_is_refused_and_a_killed_one_holds_nothing(tmp_path):
     make_journal_header("other", ["a", "b c"], [1, 2]), make_journal_header("drive", ["a"], [1]),
     make_journal_header("drive", ["a", "b"], [1, 2]),
     make_journal_header("drive", ["a", "b c"], [1, 3])])
-def test_the_journal_of_another_drive_is_refused_and_stays(tmp_path, other):
+def test_journal_of_another_drive_is_refused_and_kept(tmp_path, other):
     content = filled(tmp_path, 2)
     with pytest.raises(InputError, match="another drive"), open_journal(tmp_path, other):
         pass
@@ -102,14 +101,14 @@ def test_the_journal_of_another_drive_is_refused_and_stays(tmp_path, other):
 
 
 @pytest.mark.parametrize("broken", [b"\x00\x01", b"[1]\n", b"{}\n", b"no journal"])
-def test_what_is_no_journal_is_refused_and_stays(tmp_path, broken):
+def test_invalid_journal_is_refused_and_kept(tmp_path, broken):
     (tmp_path / JOURNAL_NAME).write_bytes(broken)
     with pytest.raises(InputError), open_journal(tmp_path, HEAD):
         pass
     assert (tmp_path / JOURNAL_NAME).read_bytes() == broken
 
 
-def test_a_line_that_is_missing_or_broken_within_is_refused(tmp_path):
+def test_missing_or_broken_line_is_refused(tmp_path):
     content = filled(tmp_path, 3).splitlines(keepends=True)
     for wrong in (content[:2] + content[3:], [*content[:2], b"{\n", *content[3:]]):
         (tmp_path / JOURNAL_NAME).write_bytes(b"".join(wrong))
@@ -136,7 +135,7 @@ with open_journal(Path(sys.argv[1]), make_journal_header("drive", ["a", "b c"], 
 """
 
 
-def test_a_full_disk_is_said_and_the_journal_goes_on_when_there_is_room(tmp_path):
+def test_full_disk_is_reported_and_writing_continues_later(tmp_path):
     result = subprocess.run([sys.executable, "-c", FULL, str(tmp_path)], text=True, check=True,
                             capture_output=True)
     done, _, said = result.stdout.partition(" ")
@@ -147,7 +146,7 @@ def test_a_full_disk_is_said_and_the_journal_goes_on_when_there_is_room(tmp_path
 
 
 @pytest.mark.parametrize("replaced", [False, True])
-def test_a_journal_that_was_removed_while_it_is_open_takes_no_more(tmp_path, replaced):
+def test_removed_journal_accepts_no_more_lines(tmp_path, replaced):
     with open_journal(tmp_path, HEAD) as journal:
         journal.append(lines(1)[0])
         (tmp_path / JOURNAL_NAME).unlink()
@@ -158,7 +157,7 @@ def test_a_journal_that_was_removed_while_it_is_open_takes_no_more(tmp_path, rep
     assert not replaced or (tmp_path / JOURNAL_NAME).read_text() == "other"
 
 
-def test_a_folder_that_cannot_be_written_is_said(tmp_path):
+def test_unwritable_folder_is_reported(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="is a file"), open_journal(tmp_path / "file", HEAD):
         pass
@@ -167,7 +166,7 @@ def test_a_folder_that_cannot_be_written_is_said(tmp_path):
         Journal(tmp_path, HEAD)
 
 
-def test_numbers_that_json_has_not_are_not_written(tmp_path):
+def test_non_finite_numbers_are_not_written(tmp_path):
     with open_journal(tmp_path, HEAD) as journal, pytest.raises(ValueError):
         journal.append({"seq": 1, "box": float("nan")})
     content = (tmp_path / JOURNAL_NAME).read_text()

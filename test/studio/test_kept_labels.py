@@ -1,4 +1,4 @@
-"""What is kept of labels from one day to the next: journals, imports and exports."""
+"""Persistence of labels: journals, imports and exports."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def labelled(made, frame=0, **more):
     made.do({"do": "add", "frame": frame, "box": BOX, "class": "Pedestrian", **more})
 
 
-def test_a_journal_is_of_what_the_sensor_saw_and_not_of_the_name_of_a_folder(tmp_path):
+def test_journal_is_identified_by_clouds_not_by_folder_name(tmp_path):
     with open_session(drive(), tmp_path) as made:
         labelled(made)
     with open_session(drive("renamed"), tmp_path) as made:
@@ -53,7 +53,7 @@ def test_a_journal_is_of_what_the_sensor_saw_and_not_of_the_name_of_a_folder(tmp
         pass
 
 
-def test_a_journal_of_before_is_of_the_drive_of_its_name(tmp_path):
+def test_old_journal_is_identified_by_the_drive_name(tmp_path):
     old = make_journal_header("monday", [f.name for f in frames()],
                               [f.stamp_ns for f in frames()], "")
     del old["clouds"]
@@ -64,8 +64,7 @@ def test_a_journal_of_before_is_of_the_drive_of_its_name(tmp_path):
         pass
 
 
-def test_a_journal_that_grew_meanwhile_is_not_written_over(tmp_path, monkeypatch):
-    """As on a file system without locks."""
+def test_journal_that_grew_meanwhile_is_not_overwritten(tmp_path, monkeypatch):
     def no_locks(*_):
         raise OSError(9, "Bad file descriptor")
     monkeypatch.setattr(fcntl, "flock", no_locks)
@@ -79,7 +78,7 @@ def test_a_journal_that_grew_meanwhile_is_not_written_over(tmp_path, monkeypatch
         labelled(one)
 
 
-def test_the_same_labels_are_imported_once_and_others_leave_what_was_there(tmp_path):
+def test_labels_are_imported_once_and_added_to_existing_ones(tmp_path):
     with open_session(drive(), tmp_path / "one") as made:
         labelled(made)
         made.export("openlabel", "labels.json")
@@ -92,13 +91,13 @@ def test_the_same_labels_are_imported_once_and_others_leave_what_was_there(tmp_p
             with pytest.raises(AlreadyImportedError):
                 made.do(asked)
         made.do({"do": "undo"})
-        made.do(asked)  # what was undone can be imported again
+        made.do(asked)  # an undone import can be repeated
         assert sorted(t.class_name for t in made.state.tracks.values()) == ["Cyclist", "Pedestrian"]
     with open_session(drive(), tmp_path / "two") as made, pytest.raises(AlreadyImportedError):
         made.do(asked)
 
 
-def test_what_imports_say_besides_boxes_is_kept_of_all_of_them():
+def test_extras_of_all_imports_are_kept():
     one = {"notes": {"0": [["DontCare", {"left": 10}]]}, "extra": {"openlabel": {"": {}}}}
     two = {"notes": {"0": [["DontCare", {"left": 20}]], "3": []}, "extra": {"kitti": {}}}
     both = join_extras(join_extras({}, one), two)
@@ -106,7 +105,7 @@ def test_what_imports_say_besides_boxes_is_kept_of_all_of_them():
     assert both["extra"].keys() == {"openlabel", "kitti"} and join_extras(both, one) == both
 
 
-def test_boxes_without_ids_that_were_joined_get_one(tmp_path):
+def test_merged_boxes_without_ids_get_one(tmp_path):
     with open_session(drive(), tmp_path / "one") as made:
         for frame in range(COUNT):
             labelled(made, frame)
@@ -122,7 +121,7 @@ def test_boxes_without_ids_that_were_joined_get_one(tmp_path):
         assert len(ids) == 1 and min(ids) >= 0
 
 
-def test_two_exports_at_once_are_both_whole_or_refused(tmp_path):
+def test_concurrent_exports_are_complete(tmp_path):
     with open_session(drive(), tmp_path) as made:
         for frame in range(COUNT):
             labelled(made, frame)
@@ -137,8 +136,7 @@ def test_two_exports_at_once_are_both_whole_or_refused(tmp_path):
         assert not [n for n in os.listdir(tmp_path) if n.endswith(".tmp")]
 
 
-def test_a_journal_is_not_replayed_with_poses_that_were_not_there(tmp_path):
-    """As of KITTI's oxts that came later: boxes between others would be elsewhere."""
+def test_journal_is_refused_if_poses_appear_or_disappear(tmp_path):
     bare, posed = drive(), Drive("monday", Recording(Path("monday"), "made up", [
         replace(frame, pose=lambda: np.eye(4)) for frame in frames()]))
     for k, (now, then) in enumerate(((bare, posed), (posed, bare))):
@@ -151,7 +149,7 @@ def test_a_journal_is_not_replayed_with_poses_that_were_not_there(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["journal.jsonl", "./other/journal.jsonl"])
-def test_no_export_is_written_over_the_journal(tmp_path, name):
+def test_export_does_not_overwrite_the_journal(tmp_path, name):
     with open_session(drive(), tmp_path) as made:
         labelled(made)
         (tmp_path / "other").symlink_to(tmp_path)
@@ -159,8 +157,7 @@ def test_no_export_is_written_over_the_journal(tmp_path, name):
             made.export("nuscenes-detection", name, force=True)
 
 
-def test_numbers_that_are_none_are_null_in_the_journal():
-    """As the velocity in nuScenes of what was labelled once."""
+def test_nan_is_null_in_the_journal():
     none, box = float("nan"), np.array([BOX])
     labels = DriveLabels([FrameLabels.of("000000", 10**8, box, ["Car"], [1], [0.5],
                                          [{"velocity": [none, 1.0]}], [("area", {"x": none})])])
@@ -171,7 +168,7 @@ def test_numbers_that_are_none_are_null_in_the_journal():
     assert back.frames[0].notes == [("area", {"x": None})]
 
 
-def test_the_command_imports_once_and_exports_no_journal_that_is_not_there(tmp_path):
+def test_command_imports_once_and_needs_a_journal_to_export(tmp_path):
     write_bag(tmp_path / "bag", frames())
 
     def run(*words):

@@ -1,4 +1,4 @@
-"""The server of the label page, as a process of its own, asked by an HTTP client."""
+"""The server of the label page in a separate process, with an HTTP client."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ ADD = {"do": "add", "frame": 0, "class": "Pedestrian", "box": BOX}
 
 
 def label(data, out, *more):
-    """To label with a server that proposes nothing by itself."""
+    """Arguments of the label command, without automatic proposals."""
     return ["label", "--data", str(data), "--out", str(out), "--no-open", "--no-propose", *more]
 
 
-def alone(*arguments):
-    """As a program of its own."""
+def standalone_command(*arguments):
+    """Command line of a separate process."""
     return [sys.executable, "-m", "lidar_perception.cli.main", *arguments]
 
 
-def test_a_page_that_is_too_far_behind_is_disconnected_and_so_reloads():
+def test_page_that_is_too_far_behind_is_disconnected():
     async def behind():
         queue, sent = asyncio.Queue(MAX_QUEUED_EVENTS), []
         page = SimpleNamespace(pages={queue}, closed=False)
@@ -57,24 +57,24 @@ def test_a_page_that_is_too_far_behind_is_disconnected_and_so_reloads():
 
 
 class Page:
-    """What a page asks."""
+    """HTTP client with the requests of the page."""
 
     def __init__(self, http, base):
         self.http, self.base = http, base
 
     async def get(self, path, **how):
-        """Status and body; the path goes out as it is."""
+        """Return status and body; the path is not normalised."""
         async with self.http.get(URL(self.base + path, encoded=True), **how) as answer:
             return answer.status, await answer.read()
 
     async def json(self, path):
-        """Of a good answer."""
+        """Return the JSON of a successful reply."""
         status, body = await self.get(path)
         assert status == 200, body
         return json.loads(body)
 
     async def do(self, expected=200, page="one", **action):
-        """An action; the answer."""
+        """Send an action and return the reply."""
         async with self.http.post(f"{self.base}/api/do", data=json.dumps(action),
                                   headers={"X-Page": page}) as answer:
             found = await answer.json()
@@ -85,15 +85,15 @@ class Page:
 
 @asynccontextmanager
 async def opened(url):
-    """A page that was opened at the address, with its cookie."""
+    """Open the address and yield a client with the cookie."""
     async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as http:
         async with http.get(url) as answer:
             assert answer.status == 200 and "text/html" in answer.headers["Content-Type"]
         yield Page(http, url.partition("/?")[0])
 
 
-def asked(url, questions):
-    """What the coroutine questions(page) gives."""
+def run_on_page(url, questions):
+    """Return the result of the coroutine questions(page)."""
     async def run():
         async with opened(url) as page:
             return await asyncio.wait_for(questions(page), 600)
@@ -101,13 +101,13 @@ def asked(url, questions):
 
 
 @pytest.fixture(scope="module")
-def served(written, tmp_path_factory):
-    """One server for the tests that leave its labels as they like."""
+def server_url(written, tmp_path_factory):
+    """Address of a server that tests share; its labels are arbitrary."""
     with serving(*label(written, tmp_path_factory.mktemp("labels"))) as server:
         yield server.url
 
 
-def test_a_cloud_says_all_that_the_page_draws(served, written):
+def test_cloud_has_all_columns_in_a_fixed_random_order(server_url, written):
     from lidar_perception.data.open import open_recording
 
     async def questions(page):
@@ -119,7 +119,7 @@ def test_a_cloud_says_all_that_the_page_draws(served, written):
         one, again = [(await page.get("/api/cloud/1"))[1] for _ in range(2)]
         assert one == again  # the order is always the same
         return one
-    body = asked(served, questions)
+    body = run_on_page(server_url, questions)
     frame = list(open_recording(written))[1].load()
     n = int(np.frombuffer(body, np.uint32, 1, 4)[0])
     assert body[:4] == b"LPC1" and n == len(frame)
@@ -134,7 +134,7 @@ def test_a_cloud_says_all_that_the_page_draws(served, written):
     assert np.abs(xyz[: n // 4].mean(axis=0) - xyz.mean(axis=0)).max() < 1  # thinned evenly
 
 
-def test_a_click_becomes_a_track_and_a_seed_and_is_like_itself(served):
+def test_click_becomes_a_track_and_a_seed_similar_to_itself(server_url):
     async def questions(page):
         before = await page.json("/api/state")
         await page.do(do="seed", frame=0, xyz=WALKER[:3].tolist(), **{"class": "Pedestrian"})
@@ -155,12 +155,12 @@ def test_a_click_becomes_a_track_and_a_seed_and_is_like_itself(served):
         nothing = await page.do(400, do="seed", frame=0, xyz=[80, 80, 80], **{"class": "Car"})
         assert "cluster" in nothing["error"]
         assert await page.json("/api/next?after=0") == {"track": None, "frame": 0}
-    asked(served, questions)
+    run_on_page(server_url, questions)
 
 
-def test_a_second_page_sees_what_the_first_does(served):
+def test_second_page_sees_actions_of_the_first(server_url):
     async def questions(page):
-        async with opened(served) as other, other.http.ws_connect(
+        async with opened(server_url) as other, other.http.ws_connect(
                 f"{other.base}/api/events") as events:
             seq = (await page.do(page="first", **ADD))["seq"]
             event = await events.receive_json()
@@ -170,7 +170,7 @@ def test_a_second_page_sees_what_the_first_does(served):
             await page.do(do="undo")
             event = await events.receive_json()
             assert event["removed"] and event["can_redo"]
-    asked(served, questions)
+    run_on_page(server_url, questions)
 
 
 @pytest.mark.parametrize("wrong", [
@@ -181,16 +181,16 @@ def test_a_second_page_sees_what_the_first_does(served):
     {"do": "import", "path": 5, "format": []},
     {"do": "seed", "frame": 0, "xyz": [0, 0], "class": "Car"},
 ], ids=str)
-def test_what_cannot_be_done_is_said_and_changes_nothing(served, wrong):
+def test_invalid_request_is_reported_and_changes_nothing(server_url, wrong):
     async def questions(page):
         before = await page.json("/api/state")
         await page.do(400, **wrong)
         assert await page.json("/api/state") == before
-    asked(served, questions)
+    run_on_page(server_url, questions)
 
 
-def test_nobody_else_is_served(served):
-    base, _, token = served.partition("/?token=")
+def test_requests_from_elsewhere_are_refused(server_url):
+    base, _, token = server_url.partition("/?token=")
     port = int(base.rpartition(":")[2])
 
     async def strangers():
@@ -218,7 +218,7 @@ def test_nobody_else_is_served(served):
         assert outside.connect_ex(("127.0.0.2", port)) != 0
 
 
-def test_only_files_of_the_page_are_served(served):
+def test_only_files_of_the_page_are_served(server_url):
     async def questions(page):
         for path in ("/static/..%2fserver.py", "/static/%2e%2e%2fserver.py", "/static/../server.py",
                      "/static//etc/passwd", "/static/..", "/static/", "/etc/passwd",
@@ -235,33 +235,33 @@ def test_only_files_of_the_page_are_served(served):
             assert answer.status == 400 and (await answer.json())["error"]
         async with page.http.post(f"{page.base}/api/do", data=b"[]") as answer:
             assert answer.status == 400
-    asked(served, questions)
+    run_on_page(server_url, questions)
 
 
-def test_what_is_told_to_a_server_that_has_ended_does_no_harm():
-    """As by the thread that listens to a running graph, which ends a little later."""
+def test_event_after_the_server_has_ended_is_ignored():
     loop = asyncio.new_event_loop()
     loop.close()
     _notify_in_loop(loop, SimpleNamespace(broadcast=None), {})
 
 
 @pytest.mark.no_cover
-def test_a_killed_server_has_lost_nothing_and_a_second_one_is_refused(written, tmp_path):
+def test_killed_server_loses_nothing_and_a_second_is_refused(written, tmp_path):
     async def edit(page):
         await page.do(**ADD)
         await page.do(do="box", track=1, frame=2, box=BOX)
         await page.do(do="undo")
         return await page.json("/api/state")
     with serving(*label(written, tmp_path)) as server:
-        before = asked(server.url, edit)
-        second = subprocess.run(alone(*label(written, tmp_path)), text=True, capture_output=True)
+        before = run_on_page(server.url, edit)
+        command = standalone_command(*label(written, tmp_path))
+        second = subprocess.run(command, text=True, capture_output=True)
         assert second.returncode == 2 and "another process" in second.stderr
         server.process.kill()
     with open(tmp_path / "journal.jsonl", "a") as journal:
         journal.write('{"seq": 4, "do": "re')
     with serving(*label(written, tmp_path)) as server:
-        assert asked(server.url, lambda page: page.json("/api/state")) == before
-        assert asked(server.url, lambda page: page.do(do="redo")) == {"seq": 4}
+        assert run_on_page(server.url, lambda page: page.json("/api/state")) == before
+        assert run_on_page(server.url, lambda page: page.do(do="redo")) == {"seq": 4}
         os.kill(server.process.pid, signal.SIGINT)
         server.process.join(60)
         assert server.process.exitcode == 0
@@ -269,11 +269,11 @@ def test_a_killed_server_has_lost_nothing_and_a_second_one_is_refused(written, t
 
 
 def limited():
-    """No file of this process grows beyond this."""
+    """Limit the size of files that this process writes."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 
 
-def test_a_full_disk_is_said_and_the_labels_stay_as_the_journal_has_them(written, tmp_path):
+def test_full_disk_is_reported_and_labels_match_the_journal(written, tmp_path):
     async def fill(page):
         for _ in range(50):
             before = await page.json("/api/state")
@@ -284,53 +284,54 @@ def test_a_full_disk_is_said_and_the_labels_stay_as_the_journal_has_them(written
                     return before
         raise AssertionError("the disk was never full")
     with serving(*label(written, tmp_path), before=limited) as server:
-        before = asked(server.url, fill)
+        before = run_on_page(server.url, fill)
     assert len(before["tracks"]) > 3
     with serving(*label(written, tmp_path)) as server:
-        assert asked(server.url, lambda page: page.json("/api/state")) == before
+        assert run_on_page(server.url, lambda page: page.json("/api/state")) == before
 
 
 @pytest.mark.no_cover
-def test_labels_go_out_and_come_back_as_they_were(written, tmp_path):
+def test_exported_labels_are_imported_unchanged(written, tmp_path):
     async def make(page):
         await page.do(**ADD)
         await page.do(do="box", track=1, frame=2, box=BOX)
         await page.do(**{**ADD, "class": "Marsmobil"})
         await page.do(do="accept", track=2)
-        asked_for = {"format": "openlabel", "out": "labels.json"}
-        async with page.http.post(f"{page.base}/api/export", json=asked_for) as answer:
+        export_request = {"format": "openlabel", "out": "labels.json"}
+        async with page.http.post(f"{page.base}/api/export", json=export_request) as answer:
             first = await answer.json()
-        async with page.http.post(f"{page.base}/api/export", json=asked_for) as answer:
+        async with page.http.post(f"{page.base}/api/export", json=export_request) as answer:
             assert answer.status == 400, await answer.text()  # it exists
         async with page.http.post(f"{page.base}/api/export",
-                                  json={**asked_for, "force": True}) as answer:
+                                  json={**export_request, "force": True}) as answer:
             assert await answer.json() == first
         for bad in ({"format": "x", "out": "y"}, {"format": "openlabel", "out": "../y"}, {}):
             async with page.http.post(f"{page.base}/api/export", json=bad) as answer:
                 assert answer.status == 400 and (await answer.json())["error"]
         return first, await page.json("/api/state")
     with serving(*label(written, tmp_path / "one")) as server:
-        written_to, state = asked(server.url, make)
+        written_to, state = run_on_page(server.url, make)
     assert written_to["boxes"] == 4 and written_to["frames"] == 3
     again = ["--import", f"openlabel:{written_to['path']}"]
     with serving(*label(written, tmp_path / "two", *again)) as server:
-        back = asked(server.url, lambda page: page.json("/api/state"))
+        back = run_on_page(server.url, lambda page: page.json("/api/state"))
         assert {(t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"]))))
                 for t in back["tracks"]} == {
             (t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"])))) for t in state["tracks"]}
-        asked(server.url, lambda page: page.do(do="undo"))
-        assert asked(server.url, lambda page: page.json("/api/state"))["tracks"] == []
+        run_on_page(server.url, lambda page: page.do(do="undo"))
+        assert run_on_page(server.url, lambda page: page.json("/api/state"))["tracks"] == []
 
 
-def test_labels_of_the_drive_are_shown_only_when_asked_for(served, written, tmp_path):
-    assert asked(served, lambda page: page.json("/api/labels/0"))["labels"] == []
+def test_labels_of_the_drive_are_shown_only_on_request(server_url, written, tmp_path):
+    assert run_on_page(server_url, lambda page: page.json("/api/labels/0"))["labels"] == []
     with serving(*label(written, tmp_path, "--show-labels")) as server:
-        (*box, name, _), = asked(server.url, lambda page: page.json("/api/labels/0"))["labels"]
+        shown = run_on_page(server.url, lambda page: page.json("/api/labels/0"))
+        (*box, name, _), = shown["labels"]
         assert np.allclose(box, WALKER) and name == "Pedestrian"
-        assert asked(server.url, lambda page: page.json("/api/labels/1"))["labels"] == []
+        assert run_on_page(server.url, lambda page: page.json("/api/labels/1"))["labels"] == []
 
 
-def test_the_drive_is_looked_at_beside_the_page_and_only_once(written, tmp_path):
+def test_drive_is_surveyed_once_in_the_background(written, tmp_path):
     async def wait(page):
         async with page.http.ws_connect(f"{page.base}/api/events") as events:
             state = await page.json("/api/state")
@@ -341,10 +342,10 @@ def test_the_drive_is_looked_at_beside_the_page_and_only_once(written, tmp_path)
         return await page.json("/api/state")
     before = None
     for _ in range(2):  # the second one finds the proposals in the journal
-        with subprocess.Popen(alone(*label(written, tmp_path, "--propose")), text=True,
+        with subprocess.Popen(standalone_command(*label(written, tmp_path, "--propose")), text=True,
                               stdout=subprocess.PIPE) as process:
             try:
-                state = asked(process.stdout.readline().strip(), wait)
+                state = run_on_page(process.stdout.readline().strip(), wait)
             finally:
                 process.kill()
         assert before is None or state == before

@@ -1,4 +1,4 @@
-"""The newest frames of a running graph, without ROS: what is kept, what is late, what is chosen."""
+"""Frames of a running graph, without ROS: storage, late boxes, selection of topics."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def frames_told(live):
     return [event["live"]["frame"] for event in live.told if "live" in event]
 
 
-def test_a_frame_waits_for_its_boxes_and_late_ones_are_told_and_counted(live, monkeypatch):
+def test_frame_waits_for_its_boxes_and_late_ones_are_counted(live, monkeypatch):
     live.add_cloud(cloud(10))
     live.add_boxes(FOUND, boxes(10), None)       # the first: from now on clouds wait for this topic
     live.add_cloud(cloud(20))
@@ -74,7 +74,7 @@ def test_a_frame_waits_for_its_boxes_and_late_ones_are_told_and_counted(live, mo
     assert [t["late"] for t in live.status()["topics"]] == [1]
 
 
-def test_boxes_may_come_before_their_cloud_and_those_without_one_are_counted(live):
+def test_early_boxes_wait_and_unmatched_ones_are_counted(live):
     live.add_boxes(FOUND, boxes(10), None)
     live.add_cloud(cloud(10))
     assert len(live.layers(0, 0.0)["detections"]["fused_detector"]) == 1
@@ -86,7 +86,7 @@ def test_boxes_may_come_before_their_cloud_and_those_without_one_are_counted(liv
 
 @given(st.lists(st.integers(1, 2000), min_size=1, max_size=60), st.integers(1, 12),
        st.integers(1, 40_000))
-def test_memory_keeps_to_its_bounds_and_the_newest_frame_is_there(sizes, most, max_bytes):
+def test_memory_is_bounded_and_the_newest_frame_is_stored(sizes, most, max_bytes):
     live = LiveGraph("test", max_bytes, most)
     for stamp, size in enumerate(sizes):
         live.add_cloud(cloud(stamp, size))
@@ -101,7 +101,7 @@ def test_memory_keeps_to_its_bounds_and_the_newest_frame_is_there(sizes, most, m
             live.load_scan(live.first - 1)
 
 
-def test_while_a_page_has_paused_frames_stay_and_what_comes_is_counted(live):
+def test_frames_stay_and_new_ones_are_counted_while_paused(live):
     for stamp in range(4):
         live.add_cloud(cloud(stamp))
     live.set_held(1, True)
@@ -115,7 +115,7 @@ def test_while_a_page_has_paused_frames_stay_and_what_comes_is_counted(live):
     assert live.end == 5
 
 
-def test_a_bag_that_begins_again_is_shown_again(live):
+def test_looping_bag_is_shown_again(live):
     for stamp in (1, 2, 1, 2):
         live.add_cloud(cloud(stamp))
         live.add_boxes(FOUND, boxes(stamp), None)
@@ -123,7 +123,7 @@ def test_a_bag_that_begins_again_is_shown_again(live):
     assert all(live.layers(i, 0.0)["detections"] for i in range(4))
 
 
-def test_labels_that_come_before_their_cloud_do_so_when_a_bag_begins_again_too(live):
+def test_early_labels_are_matched_when_a_bag_loops(live):
     live.expect_topic("/ground_truth/detections", LABELS)
     for stamp in (1, 2, 1, 2):
         live.add_boxes("/ground_truth/detections", boxes(stamp), None)
@@ -132,7 +132,7 @@ def test_labels_that_come_before_their_cloud_do_so_when_a_bag_begins_again_too(l
     assert live.status()["topics"][1]["alone"] == 0
 
 
-def test_boxes_that_tf_does_not_connect_are_said_and_broken_ones_left_out(live):
+def test_missing_tf_is_reported_and_invalid_boxes_left_out(live):
     live.add_cloud(cloud(1))
     live.add_boxes(FOUND, boxes(1, "base_link"), None)
     line, = live.status()["lines"]
@@ -145,8 +145,7 @@ def test_boxes_that_tf_does_not_connect_are_said_and_broken_ones_left_out(live):
     assert live.status()["lines"] == []
 
 
-def test_boxes_in_another_frame_are_those_of_the_clouds_once_tf_has_come(live, monkeypatch):
-    """What is fixed and what moves between them; with trails; each at its own stamp."""
+def test_boxes_in_another_frame_are_transformed_once_tf_arrives(live, monkeypatch):
     live.expect_topic(TRACKED, TRACKS)
     second = 10**9
     mounted, turned = [1.0, 0.5, 1.7], [0.0, 0.0, np.sin(0.2), np.cos(0.2)]  # by 0.4 rad
@@ -180,7 +179,7 @@ def test_boxes_in_another_frame_are_those_of_the_clouds_once_tf_has_come(live, m
     assert frames_told(live)[-1] == 2  # shown without
 
 
-def test_tracks_of_two_trackers_keep_apart_and_labels_say_what_is_missed(live):
+def test_two_trackers_have_distinct_ids_and_misses_are_known(live):
     live.expect_topic(TRACKED, TRACKS)
     live.expect_topic("/b/tracker/output/tracks", TRACKS)
     live.expect_topic("/ground_truth/detections", LABELS)
@@ -197,7 +196,7 @@ def test_tracks_of_two_trackers_keep_apart_and_labels_say_what_is_missed(live):
     assert len({t["id"] for t in live.tracks()}) == 2
 
 
-def test_the_cloud_with_most_columns_is_chosen_and_the_boxes_of_its_namespace():
+def test_cloud_with_most_columns_and_its_boxes_are_selected():
     one = {"/points": CLOUD, "/ground_segmentation/output/points": CLOUD,
            "/clustering/output/points": CLOUD, FOUND: MARKERS, FOUND + "_3d": ARRAY,
            TRACKED: MARKERS, "/ground_truth/detections": MARKERS,
@@ -222,7 +221,7 @@ def test_the_cloud_with_most_columns_is_chosen_and_the_boxes_of_its_namespace():
         assert "\n" not in str(said.value)
 
 
-def test_boxes_of_another_robot_are_not_shown_with_the_clouds_of_this_one():
+def test_boxes_of_another_robot_are_not_selected():
     one = dict.fromkeys([FOUND, TRACKED, TRUTH], MARKERS) | {"/clustering/output/points": CLOUD}
     both = one | {f"/b{topic}": kind for topic, kind in one.items()}
     for robot in ("", "/b"):
@@ -241,8 +240,7 @@ def test_boxes_of_another_robot_are_not_shown_with_the_clouds_of_this_one():
     assert set(select_box_topics(one, "/ouster/points")) == {FOUND, TRACKED, TRUTH}
 
 
-def test_pages_may_ask_while_topics_come_and_go(live):
-    """In another thread, as the server does; threads take turns as often as they can."""
+def test_requests_while_topics_change_are_thread_safe(live):
     before, wrong = sys.getswitchinterval(), []
     sys.setswitchinterval(1e-6)
     over = threading.Event()

@@ -1,4 +1,4 @@
-"""What proposals mean for the tracks that are there, without a drive."""
+"""Merging of proposals with existing tracks, without a drive."""
 
 from __future__ import annotations
 
@@ -19,17 +19,16 @@ MOTION = Motion.of(np.arange(8) * 10**8)
 
 
 def straight(x, y, frames, kind=PROPOSED, **more):
-    """A track that stands."""
+    """A track of an object that does not move."""
     boxes = {f: Box((x, y, -1.0, 0.8, 0.6, 1.7, 0.0), kind) for f in frames}
     return Track(0, "Pedestrian", boxes=boxes, **{"source": "fused", **more})
 
 
 def with_id(track, number, **more):
-    """The same under its number."""
     return replace(track, id=number, **more)
 
 
-def test_proposals_keep_ids_and_take_nothing_from_a_person():
+def test_proposals_keep_ids_and_edits_of_a_person():
     old = {1: with_id(straight(5, 0, range(8)), 1),
            2: with_id(straight(9, 0, range(8)), 2, state="rejected"),
            3: with_id(straight(20, 0, range(8)), 3),
@@ -47,8 +46,7 @@ def test_proposals_keep_ids_and_take_nothing_from_a_person():
     assert merge_proposals(again, new, MOTION) == ([], [])
 
 
-def test_an_imported_box_and_one_of_a_proposal_are_no_clicks():
-    """Labels without track ids are tracks of one box each: nobody asked to follow them."""
+def test_single_boxes_without_a_click_are_not_tracked():
     old = {n: with_id(straight(5, 0, [n], kind=KEY), n, state="accepted", source=source)
            for n, source in enumerate(("imported", "fused", "person"), 1)}
     assert merge_proposals(State(old, next_id=4), [straight(5, 0, range(8))], MOTION) == ([], [])
@@ -56,12 +54,12 @@ def test_an_imported_box_and_one_of_a_proposal_are_no_clicks():
 
 @pytest.mark.parametrize("work", [{"do": "class", "track": 1, "class": "Cyclist"},
                                   {"do": "split", "track": 1, "frame": 4}])
-def test_proposals_leave_what_a_person_named_or_cut(work):
+def test_proposals_leave_tracks_that_a_person_edited(work):
     state, _ = apply(State({1: with_id(straight(5, 0, range(8)), 1)}, next_id=2), work, MOTION)
     assert merge_proposals(state, [straight(5, 0, range(8))], MOTION) == ([], [])
 
 
-def test_a_click_that_ends_here_is_not_followed_beyond():
+def test_trimmed_click_is_not_tracked_beyond_the_cut():
     near = with_id(straight(5, 0, [2, 4], source="click"), 1, state="accepted", nearby=True)
     near = replace(near, boxes=near.boxes | straight(5, 0, [3], kind=KEY).boxes)
     state, _ = apply(State({1: near}, next_id=2), {"do": "trim", "track": 1, "frame": 3,
@@ -70,7 +68,7 @@ def test_a_click_that_ends_here_is_not_followed_beyond():
     assert sorted(found.boxes) == [0, 1, 2, 3] and not found.nearby
 
 
-def test_two_clicks_in_one_frame_are_both_there():
+def test_two_clicks_in_one_frame_are_both_found():
     look = FrameSurvey(Detections.none(), np.zeros((0, 7)), np.zeros((0, 80), np.uint32), {},
                        np.zeros((0, 7)))
     both = [(np.array([x, 0.0, -1, 0.8, 0.6, 1.7, 0]), "Pedestrian") for x in (5.0, 9.0)]

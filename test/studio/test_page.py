@@ -1,4 +1,4 @@
-"""The page of label and view in a real browser, with the real server behind it."""
+"""The page of label and view in a browser, with the real server."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidar_perception.geometry import wrap_angle
 pytestmark = pytest.mark.no_cover  # others run these lines
 
 
-def test_a_click_on_a_person_makes_a_track_and_a_seed(page, labels, person):
+def test_click_on_a_person_makes_a_track_and_a_seed(page, labels, person):
     seeds = len(labels.state()["seeds"])
     number = labels.seed(page, person)
     state, box = labels.state(), labels.box(number)
@@ -25,11 +25,11 @@ def test_a_click_on_a_person_makes_a_track_and_a_seed(page, labels, person):
     assert page.inner_text("#who") == f"Track {number}"
 
 
-def test_a_seed_needs_no_mouse(page, labels, person):
+def test_seed_works_without_a_mouse(page, labels, person):
     before = set(labels.tracks())
     labels.look_at(page, person)
     page.locator("#tracks").focus()
-    for key in ("Escape", "s", "Enter"):  # what is in the middle of the view
+    for key in ("Escape", "s", "Enter"):  # picks the middle of the view
         page.keyboard.press(key)
     page.wait_for_function("before => page.store.selected !== null "
                            "&& !before.includes(page.store.selected)", arg=sorted(before))
@@ -37,7 +37,7 @@ def test_a_seed_needs_no_mouse(page, labels, person):
     assert math.dist(box[:2], person[:2]) < 0.6
 
 
-def test_keys_accept_reject_and_open_again_and_the_progress_is_in_sight(page, labels, person):
+def test_keys_accept_reject_and_reopen_and_update_the_progress(page, labels, person):
     number = labels.chosen(page, person)
     for key, state in (("r", "rejected"), ("a", "accepted"), ("u", "proposed")):
         page.keyboard.press(key)
@@ -49,7 +49,7 @@ def test_keys_accept_reject_and_open_again_and_the_progress_is_in_sight(page, la
                                ".startsWith(s)", arg=f"{progress['left']} left")
 
 
-def test_all_is_in_reach_in_half_a_screen(page, labels, person):
+def test_all_controls_fit_into_half_a_screen(page, labels, person):
     labels.chosen(page, person)
     whole = page.viewport_size
     page.set_viewport_size({"width": 800, "height": 900})
@@ -66,7 +66,7 @@ def test_all_is_in_reach_in_half_a_screen(page, labels, person):
 @pytest.mark.parametrize(("where", "name", "way"), [
     ("[data-view=top]", "+x", (40, 0)), ("[data-view=side]", "+z", (0, -25)),
     ("[data-view=front]", "-y", (20, 0)), ("#handles", "+z", (0, -40))])
-def test_a_dragged_face_moves_alone(page, labels, person, where, name, way):
+def test_dragged_face_moves_alone(page, labels, person, where, name, way):
     number = labels.chosen(page, person)
     before = labels.box(number)
     drag(page, middle(page, f"{where} circle[data-handle='{name}']"), way)
@@ -78,7 +78,7 @@ def test_a_dragged_face_moves_alone(page, labels, person, where, name, way):
 
 
 @pytest.mark.parametrize("key", ["s", "Escape"])
-def test_handles_are_gone_with_the_key_and_not_with_the_next_picture(page, labels, person, key):
+def test_handles_disappear_immediately_with_the_key(page, labels, person, key):
     labels.chosen(page, person)
     page.wait_for_function("() => document.getElementById('handles').style.display === ''")
     assert page.evaluate("""async key => {
@@ -88,7 +88,7 @@ def test_handles_are_gone_with_the_key_and_not_with_the_next_picture(page, label
     }""", key) == "none"
 
 
-def test_the_body_is_dragged_level_and_turns_about_its_centre(page, labels, person):
+def test_body_is_dragged_horizontally_and_turns_about_its_centre(page, labels, person):
     number = labels.chosen(page, person)
     before = labels.box(number)
     drag(page, middle(page, "[data-view=top] rect.body"), (30, 10))
@@ -104,7 +104,7 @@ def test_the_body_is_dragged_level_and_turns_about_its_centre(page, labels, pers
     assert wrap_angle(turned[6] - moved[6]) == pytest.approx(math.pi / 2, abs=0.1)
 
 
-def test_arrow_keys_step_along_the_box_and_a_held_key_is_one_action(page, labels, person):
+def test_arrow_keys_move_along_the_box_as_one_action(page, labels, person):
     number = labels.chosen(page, person)
     before, actions = labels.box(number), labels.state()["seq"]
     for _ in range(3):
@@ -120,7 +120,7 @@ def test_arrow_keys_step_along_the_box_and_a_held_key_is_one_action(page, labels
     assert wrap_angle(labels.box(number)[6] - before[6]) == pytest.approx(math.radians(1))
 
 
-def test_what_is_typed_or_held_is_of_the_track_and_the_frame_where_that_began(page, labels, person):
+def test_input_belongs_to_the_track_and_frame_where_it_began(page, labels, person):
     other, number = labels.chosen(page, person), labels.chosen(page, person)
     labels.wait(page, other, lambda t: t is not None)
     page.click("[data-filter=all]")
@@ -138,8 +138,7 @@ def test_what_is_typed_or_held_is_of_the_track_and_the_frame_where_that_began(pa
     page.wait_for_function("() => page.store.frame === 0")
 
 
-def test_a_row_that_is_pressed_is_chosen_though_the_list_changes_meanwhile(page, labels, person):
-    """As it does when an action of somebody comes from the server."""
+def test_pressed_row_is_selected_though_the_list_changes(page, labels, person):
     other, number = labels.chosen(page, person), labels.chosen(page, person)
     labels.wait(page, other, lambda t: t is not None)
     page.click("[data-filter=all]")
@@ -154,7 +153,7 @@ def test_a_row_that_is_pressed_is_chosen_though_the_list_changes_meanwhile(page,
         page.wait_for_selector(f"[data-track='{chosen}'][aria-selected=true]")
 
 
-def test_a_hand_that_shakes_moves_no_box_and_space_presses_no_button(page, labels, person):
+def test_small_drag_moves_no_box_and_space_presses_no_button(page, labels, person):
     number = labels.chosen(page, person)
     lines = len(labels.lines())
     drag(page, middle(page, "[data-view=top] rect.body"), (2, 2))
@@ -168,7 +167,7 @@ def test_a_hand_that_shakes_moves_no_box_and_space_presses_no_button(page, label
     assert labels.tracks()[number]["boxes"]
 
 
-def test_undo_and_redo_go_back_and_forth_over_every_step(page, labels, person):
+def test_undo_and_redo_step_through_every_state(page, labels, person):
     number = labels.chosen(page, person)
     states = [labels.tracks()]
     for key in ("Shift+ArrowUp", "g", "1", "v"):
@@ -185,7 +184,7 @@ def test_undo_and_redo_go_back_and_forth_over_every_step(page, labels, person):
     assert page.locator("#errors .toast").count() == 0
 
 
-def test_the_class_of_a_seed_is_chosen_at_the_click(page, labels, person):
+def test_class_of_a_seed_is_chosen_at_the_click(page, labels, person):
     number = labels.chosen(page, person)
     page.keyboard.press("s")
     page.keyboard.press("3")  # of new ones, though a track is selected
@@ -203,7 +202,7 @@ def test_the_class_of_a_seed_is_chosen_at_the_click(page, labels, person):
     page.keyboard.press("Escape")
 
 
-def test_one_key_rejects_all_that_is_left_and_one_takes_it_back(page, labels, person):
+def test_one_key_rejects_all_undecided_and_one_undoes_it(page, labels, person):
     others = []
     for _ in range(2):
         others.append(number := labels.chosen(page, person))
@@ -234,7 +233,7 @@ def test_pages_see_each_others_edits(page, browser, labels, person):
                                arg=[number, name])
 
 
-def test_what_cannot_be_saved_is_said_and_goes_back(page, labels, person):
+def test_unsaved_edit_is_reported_and_reverted(page, labels, person):
     number = labels.chosen(page, person)
     before = labels.tracks()
     page.keyboard.press("x")  # there is nothing before its only frame, or after it
@@ -246,7 +245,7 @@ def test_what_cannot_be_saved_is_said_and_goes_back(page, labels, person):
     page.wait_for_function("() => Number(document.getElementById('field-length').value) > 0")
 
 
-def test_an_export_is_written_and_nothing_is_written_over_it(page, labels, person):
+def test_export_is_written_and_not_overwritten(page, labels, person):
     number = labels.chosen(page, person)
     page.keyboard.press("a")
     labels.wait(page, number, lambda t: t["state"] == "accepted")
@@ -264,7 +263,7 @@ def test_an_export_is_written_and_nothing_is_written_over_it(page, labels, perso
     assert "openlabel" in json.loads((labels.out / "labels.json").read_text())
 
 
-def test_why_nothing_was_imported_is_said_where_one_looks(page, labels):
+def test_failed_import_is_reported_in_the_dialog(page, labels):
     page.click("#import")
     page.fill("#import-path", "/nowhere")
     page.click("#import-form button.primary")
@@ -273,13 +272,13 @@ def test_why_nothing_was_imported_is_said_where_one_looks(page, labels):
     assert "/nowhere" not in page.inner_text("#errors")
 
 
-def test_help_lists_the_keys_and_needs_no_mouse(page):
+def test_help_lists_the_keys_and_works_without_a_mouse(page):
     page.keyboard.press("?")
     page.wait_for_selector("#help[open]")
     assert "Accept" in page.inner_text("#keys") and "Undo" in page.inner_text("#keys")
     page.keyboard.press("Escape")
     page.wait_for_selector("#help", state="hidden")
-    for _ in range(40):  # every command can be reached, and says what it is
+    for _ in range(40):  # every command can be reached and has a name
         page.keyboard.press("Tab")
         name = page.evaluate("""() => { const e = document.activeElement;
             return e === document.body ? "-" : e.ariaLabel || e.title || e.textContent.trim()
@@ -287,7 +286,7 @@ def test_help_lists_the_keys_and_needs_no_mouse(page):
         assert name, page.evaluate("document.activeElement.outerHTML.slice(0, 200)")
 
 
-def test_a_killed_server_loses_nothing(page, browser, labels, person):
+def test_killed_server_loses_nothing(page, browser, labels, person):
     number = labels.chosen(page, person)
     drag(page, middle(page, "[data-view=top] rect.body"), (10, 20))
     page.wait_for_function("() => page.store.draft === null")
@@ -305,7 +304,7 @@ def test_a_killed_server_loses_nothing(page, browser, labels, person):
                                ".includes('address')")  # its token is another one now
 
 
-def test_view_shows_labels_and_detections_from_a_score_on(browser, drive_bag):
+def test_view_shows_labels_and_refuses_actions(browser, drive_bag):
     with serving("view", drive_bag, "--no-open") as shown, opened(browser, shown.url) as page:
         truth = next(iter(open_recording(drive_bag))).truth()
         assert page.evaluate("page.store.results.labels.length") == len(truth)
@@ -317,8 +316,8 @@ def test_view_shows_labels_and_detections_from_a_score_on(browser, drive_bag):
         assert "label" in reply["error"]
 
 
-def test_view_selects_single_labels_and_keys_step_through_what_is_missed(browser, drive_bag,
-                                                                         tmp_path):
+def test_view_selects_labels_and_keys_step_through_missed_ones(browser, drive_bag,
+                                                               tmp_path):
     results = tmp_path / "nothing"  # was found in any frame
     results.mkdir()
     with serving("view", drive_bag, "--results", results, "--no-open") as shown, \

@@ -1,4 +1,4 @@
-"""What the page shows is what is saved: what is typed, keys that are fast, a state that is late."""
+"""Saving in the page: typed numbers, fast keys, late states."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from labeling_pages import boxes_of, opened
 pytestmark = pytest.mark.no_cover  # others run these lines
 
 
-def test_a_typed_number_changes_this_one_alone_and_none_or_escape_changes_nothing(page, labels,
-                                                                                  person):
+def test_typed_number_changes_only_itself_and_escape_nothing(page, labels,
+                                                             person):
     number = labels.chosen(page, person)
     page.click("[data-filter=all]")
     before, lines = labels.box(number), len(labels.lines())
@@ -26,7 +26,7 @@ def test_a_typed_number_changes_this_one_alone_and_none_or_escape_changes_nothin
         labels.wait(page, number, lambda t, y=there[1]: boxes_of(t)[0][1] == y)
         page.wait_for_function("y => document.getElementById('field-y').value === y",
                                arg=f"{there[1]:.2f}")
-    page.click("#errors .toast button")  # what was refused is said
+    page.click("#errors .toast button")  # the refusal was reported
     assert labels.box(number) == [before[0], 4.567, *before[2:]]
     assert len(labels.lines()) == lines + 1
     page.focus("#field-x")
@@ -37,8 +37,8 @@ def test_a_typed_number_changes_this_one_alone_and_none_or_escape_changes_nothin
     labels.wait(page, number, lambda t: boxes_of(t)[0][:2] == [3.25, 2.125])
 
 
-def test_keys_while_a_frame_is_on_its_way_are_of_the_one_that_is_shown(browser, page, labels,
-                                                                       person):
+def test_keys_while_a_frame_loads_apply_to_the_shown_one(browser, page, labels,
+                                                         person):
     number = labels.chosen(page, person)
     before, held = labels.box(number), []
     with opened(browser, f"{labels.url}&track={number}") as other:
@@ -55,7 +55,7 @@ def test_keys_while_a_frame_is_on_its_way_are_of_the_one_that_is_shown(browser, 
     assert math.dist(labels.box(number)[:2], before[:2]) == pytest.approx(0.05)
 
 
-def test_each_frame_is_checked_once_however_fast_the_key_is(browser, page, labels):
+def test_each_frame_is_checked_once_at_any_key_speed(browser, page, labels):
     with opened(browser, labels.url) as other:
         held = []
         other.route("**/api/cloud/4*", lambda route: held.append(route))
@@ -77,7 +77,7 @@ def test_each_frame_is_checked_once_however_fast_the_key_is(browser, page, label
         other.wait_for_function("() => page.store.checked.size === 0")
 
 
-def test_an_arrow_moves_the_box_after_a_class_is_chosen_by_mouse(page, labels, person):
+def test_arrow_moves_the_box_after_a_class_was_chosen_by_mouse(page, labels, person):
     number = labels.chosen(page, person)
     before = labels.box(number)
     page.click("#class")
@@ -96,7 +96,7 @@ def test_an_arrow_moves_the_box_after_a_class_is_chosen_by_mouse(page, labels, p
     page.click("#errors .toast button")
 
 
-def test_a_state_that_comes_late_takes_nothing_back(browser, page, labels, person):
+def test_late_state_reverts_nothing(browser, page, labels, person):
     number, states = labels.chosen(page, person), []
 
     def reply(route):
@@ -121,7 +121,7 @@ def test_a_state_that_comes_late_takes_nothing_back(browser, page, labels, perso
         assert other.evaluate(same, [number, name])
 
 
-def test_the_browser_asks_before_it_leaves_what_is_not_saved_yet(browser, labels):
+def test_browser_confirms_leaving_with_unsaved_actions(browser, labels):
     held, asked = [], []
     with opened(browser, labels.url) as other:
         other.route("**/api/do*", lambda route: held.append(route))
@@ -138,7 +138,7 @@ def test_the_browser_asks_before_it_leaves_what_is_not_saved_yet(browser, labels
         other.wait_for_function("() => page.store.checked.size === 0")
 
 
-def test_an_export_has_what_was_done_before_it_though_that_is_saved_slowly(page, labels, person):
+def test_export_waits_for_actions_that_are_saved_slowly(page, labels, person):
     number, held = labels.chosen(page, person), []
     before = labels.box(number)
     page.route("**/api/do*", lambda route: held.append(route))
@@ -156,7 +156,7 @@ def test_an_export_has_what_was_done_before_it_though_that_is_saved_slowly(page,
     assert heights[str(number)] == labels.box(number)[2] > before[2]
 
 
-def test_what_was_saved_is_not_said_to_be_lost_where_no_answer_to_it_comes(browser, labels):
+def test_saved_action_without_event_is_not_reported_as_lost(browser, labels):
     def deaf(page):
         page.add_init_script("WebSocket = class {}")
 

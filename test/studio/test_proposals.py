@@ -1,5 +1,4 @@
-"""Proposals of a whole drive: what they do to labels that are there, and what a scripted annotator
-makes of them. On a simulated drive, by seeds alone."""
+"""Proposals for a simulated drive from seeds only, and the simulated annotator."""
 
 from __future__ import annotations
 
@@ -40,51 +39,51 @@ def drive(streets):
 
 
 @pytest.fixture
-def made(drive, tmp_path):
-    """Labels of which there are none yet; no detector."""
-    with open_session(drive, tmp_path, detector=None) as made:
-        yield made
+def session(drive, tmp_path):
+    """A session without labels and without a detector."""
+    with open_session(drive, tmp_path, detector=None) as session:
+        yield session
 
 
-def person(made):
-    """The labelled person who is nearest: boxes by frame, and a point that was measured."""
-    people = Truth(made).people.values()
+def person(session):
+    """Return the nearest labelled person: boxes by frame, the first frame, and a measured point."""
+    people = Truth(session).people.values()
     boxes = min(people, key=lambda b: np.hypot(*next(iter(b.values()))[:2]))
     frame = min(boxes)
-    scan = made.drive.load_scan(frame)
+    scan = session.drive.load_scan(frame)
     inside = scan.xyz[points_in_box(scan.xyz, boxes[frame]) & (scan.cluster_ids > 0)]
     return boxes, frame, inside[len(inside) // 2].tolist()
 
 
-def click(made):
-    """A seed on that person; the track."""
-    boxes, frame, xyz = person(made)
-    made.do({"do": "seed", "frame": frame, "xyz": xyz, "class": "Pedestrian"})
-    return boxes, made.state.tracks[made.state.seeds[-1][1]]
+def click(session):
+    """Click that person; return the boxes and the track."""
+    boxes, frame, xyz = person(session)
+    session.do({"do": "seed", "frame": frame, "xyz": xyz, "class": "Pedestrian"})
+    return boxes, session.state.tracks[session.state.seeds[-1][1]]
 
 
-def test_a_clicked_person_is_followed_through_the_drive(made):
-    made.propose(in_process=True)
-    assert not made.state.tracks  # nothing is like nobody
-    boxes, track = click(made)
+def test_clicked_person_is_tracked_through_the_drive(session):
+    session.propose(in_process=True)
+    assert not session.state.tracks  # nothing is like nobody
+    boxes, track = click(session)
     assert len(boxes) >= FRAMES - 1 and boxes.keys() <= track.boxes.keys()
     near = [np.hypot(*(np.array(track.boxes[f].values)[:2] - b[:2])) for f, b in boxes.items()]
     assert max(near) < 0.5
     assert all(t.class_name == "Pedestrian" and t.state == PROPOSED
-               for t in made.state.tracks.values() if t.id != track.id)
+               for t in session.state.tracks.values() if t.id != track.id)
 
 
-def boxes_of(made):
-    """Of all tracks, with what they are but for their ids, which say when they were found."""
+def boxes_of(session):
+    """Return all tracks without their ids, which depend on the order of discovery."""
     return {(t.class_name, t.state, t.source, t.score, tuple(sorted(t.boxes.items())))
-            for t in made.state.tracks.values()}
+            for t in session.state.tracks.values()}
 
 
-def test_a_seed_in_a_long_drive_is_answered_at_once_and_in_the_end_in_full(
-        made, drive, tmp_path, monkeypatch):
-    made.propose(in_process=True)
-    click(made)
-    full = boxes_of(made)
+def test_seed_in_a_long_drive_is_tracked_nearby_first(
+        session, drive, tmp_path, monkeypatch):
+    session.propose(in_process=True)
+    click(session)
+    full = boxes_of(session)
     with open_session(drive, tmp_path / "long", detector=None) as long:
         long.propose(in_process=True)
         before = long.state
@@ -101,41 +100,41 @@ def test_a_seed_in_a_long_drive_is_answered_at_once_and_in_the_end_in_full(
         assert long.state.tracks == before.tracks and long.state.seeds == before.seeds
 
 
-def test_seed_is_applied_once_and_its_tracks_are_encoded_once(made, monkeypatch):
-    made.propose(in_process=True)
+def test_seed_is_applied_once_and_its_tracks_are_encoded_once(session, monkeypatch):
+    session.propose(in_process=True)
     applied, encoded = [], []
     monkeypatch.setattr("lidar_studio.session.apply",
                         lambda *args: applied.append(args) or apply(*args))
     monkeypatch.setattr("lidar_studio.session.track_to_json",
                         lambda track: encoded.append(track.id) or track_to_json(track))
     monkeypatch.setattr("lidar_studio.state.track_from_json", None)
-    click(made)
+    click(session)
     assert len(applied) == 1
     assert encoded and len(set(encoded)) == len(encoded)
 
 
-def test_a_car_that_is_clicked_is_a_seed_too_and_others_like_it_are_proposed(made):
-    made.propose(in_process=True)
-    frame = made.drive.frames[0]
-    truth, scan = frame.truth(), made.drive.load_scan(0)
+def test_clicked_car_is_a_seed_and_similar_cars_are_proposed(session):
+    session.propose(in_process=True)
+    frame = session.drive.frames[0]
+    truth, scan = frame.truth(), session.drive.load_scan(0)
     cars = truth.of_class(CAR)
     inside = [scan.xyz[points_in_box(scan.xyz, b) & (scan.cluster_ids > 0)] for b in cars]
     seen = sorted(range(len(cars)), key=lambda k: -len(inside[k]))
     points = inside[seen[0]]
     middle = points[np.linalg.norm(points - cars[seen[0]][:3], axis=1).argmin()]
-    made.do({"do": "seed", "frame": 0, "xyz": middle.tolist(), "class": "Car"})
-    own = made.state.tracks[made.state.seeds[-1][1]]
+    session.do({"do": "seed", "frame": 0, "xyz": middle.tolist(), "class": "Car"})
+    own = session.state.tracks[session.state.seeds[-1][1]]
     assert own.class_name == "Car" and math.dist(own.boxes[0].values[:2], cars[seen[0]][:2]) < 1.5
-    other = [t for t in made.state.tracks.values() if t.id != own.id]
+    other = [t for t in session.state.tracks.values() if t.id != own.id]
     assert other and all(t.class_name == "Car" and t.state == PROPOSED for t in other)
     scores = [t.score for t in sorted(other, key=lambda t: t.id)]
     assert scores == sorted(scores, reverse=True)
-    silhouettes = made.proposer.silhouettes(made.state, own, 0)
+    silhouettes = session.proposer.silhouettes(session.state, own, 0)
     assert silhouettes["similarity"] > 0.9 and "1" in silhouettes["seed"]["bits"]
 
 
 @given(st.floats(0.5, 12), st.floats(0.3, 3), st.floats(0.5, 4), st.floats(0.2, 1.2))
-def test_what_is_as_large_as_the_seed_is_most_alike(length, width, height, share):
+def test_cluster_of_the_seed_size_is_most_similar(length, width, height, share):
     length, width = max(length, width), min(length, width)
     size = length, width, height
     same = np.array([[9.0, 0, 0, *size, 0.3]])
@@ -147,84 +146,83 @@ def test_what_is_as_large_as_the_seed_is_most_alike(length, width, height, share
     assert larger == sorted(larger, reverse=True) and larger[-1] < 0.1
 
 
-def frames_looked_at(drive, folder, until=FRAMES):
-    """Of a session that is ended once so many frames are looked at; what it says, its labels."""
-    looked_at, said = [], []
-    with open_session(drive, folder, detector=None) as made:
-        made.listeners.append(lambda event: said.append(event.get("error", "")))
+def run_survey(drive, folder, until=FRAMES):
+    """Survey until a number of frames; return the progress, the messages and the labels."""
+    progress, messages = [], []
+    with open_session(drive, folder, detector=None) as session:
+        session.listeners.append(lambda event: messages.append(event.get("error", "")))
 
-        def told(count):
-            looked_at.append(count)
+        def report(count):
+            progress.append(count)
             if count == until < FRAMES:
-                made.cancel()
-        made.propose(in_process=True, on_progress=told)
+                session.cancel()
+        session.propose(in_process=True, on_progress=report)
         if until == FRAMES:
-            click(made)
-    return looked_at, "".join(said), boxes_of(made)
+            click(session)
+    return progress, "".join(messages), boxes_of(session)
 
 
-def kept_in(folder):
+def read_cache(folder):
     return {p.name: p.read_bytes() for p in (folder / survey_cache.FOLDER).iterdir()}
 
 
 @pytest.mark.parametrize("posed", [True, False])
-def test_a_survey_that_was_ended_goes_on_where_it_was(drive, tmp_path, monkeypatch, posed):
+def test_cancelled_survey_is_continued(drive, tmp_path, monkeypatch, posed):
     monkeypatch.setattr(survey_cache, "FRAMES_PER_FILE", 2)
     if not posed:  # then KISS-ICP finds the poses, scan after scan
         pytest.importorskip("kiss_icp")
         frames = [replace(frame, pose=lambda: None) for frame in drive.frames]
         drive = Drive("simulated", Recording(Path("simulated"), "simulated", frames))
-    whole = frames_looked_at(drive, tmp_path / "whole")
+    whole = run_survey(drive, tmp_path / "whole")
     assert whole[:2] == ([1, 2, 3, 4, 5, 6], "")
-    ended = frames_looked_at(drive, tmp_path / "ended", until=5)
+    ended = run_survey(drive, tmp_path / "ended", until=5)
     assert ended == ([1, 2, 3, 4, 5], "", set())
-    assert kept_in(tmp_path / "ended").items() < kept_in(tmp_path / "whole").items()
-    looked_at, said, labels = frames_looked_at(drive, tmp_path / "ended")
-    assert not said and looked_at == ([5, 6] if posed else [4, 4, 4, 4, 5, 6])
-    assert kept_in(tmp_path / "ended") == kept_in(tmp_path / "whole") and labels == whole[2]
+    assert read_cache(tmp_path / "ended").items() < read_cache(tmp_path / "whole").items()
+    progress, messages, labels = run_survey(drive, tmp_path / "ended")
+    assert not messages and progress == ([5, 6] if posed else [4, 4, 4, 4, 5, 6])
+    assert read_cache(tmp_path / "ended") == read_cache(tmp_path / "whole") and labels == whole[2]
 
 
-def test_a_survey_of_something_else_is_begun_anew_and_that_is_said(drive, tmp_path, monkeypatch):
+def test_survey_of_another_drive_is_replaced_and_reported(drive, tmp_path, monkeypatch):
     monkeypatch.setattr(survey_cache, "FRAMES_PER_FILE", 2)
     other = Drive("simulated", Recording(Path("simulated"), "simulated", [
         replace(frame, load=drive.frames[0].load) for frame in drive.frames]))  # other clouds only
-    frames_looked_at(drive, tmp_path, until=5)
+    run_survey(drive, tmp_path, until=5)
     (tmp_path / JOURNAL_NAME).unlink()  # the journal is of the clouds, too
-    looked_at, said, _ = frames_looked_at(other, tmp_path, until=3)
-    assert looked_at == [1, 2, 3] and "another survey (clouds " in said
-    assert kept_in(tmp_path).keys() == {"000000.npz"}
+    progress, messages, _ = run_survey(other, tmp_path, until=3)
+    assert progress == [1, 2, 3] and "another survey (clouds " in messages
+    assert read_cache(tmp_path).keys() == {"000000.npz"}
     (tmp_path / JOURNAL_NAME).unlink()
-    looked_at, said, _ = frames_looked_at(drive, tmp_path)
-    assert looked_at == [1, 2, 3, 4, 5, 6] and "surveyed again" in said
+    progress, messages, _ = run_survey(drive, tmp_path)
+    assert progress == [1, 2, 3, 4, 5, 6] and "surveyed again" in messages
     found, why = survey_cache.read(tmp_path / survey_cache.FOLDER,
                                    survey_cache.make_key(drive, DetectorChoice("pointpillars")))
     assert found == [] and "weights '', not 'pointpillars'" in why
 
 
-def test_a_survey_takes_no_more_room_than_it_may(drive, tmp_path, monkeypatch):
+def test_survey_cache_is_bounded(drive, tmp_path, monkeypatch):
     monkeypatch.setattr(survey_cache, "FRAMES_PER_FILE", 2)
     monkeypatch.setattr(survey_cache, "MAX_BYTES", 60_000)
-    looked_at, said, labels = frames_looked_at(drive, tmp_path)
-    assert len(looked_at) == FRAMES and labels and "are cached" in said
-    sizes = [len(content) for content in kept_in(tmp_path).values()]
+    progress, messages, labels = run_survey(drive, tmp_path)
+    assert len(progress) == FRAMES and labels and "are cached" in messages
+    sizes = [len(content) for content in read_cache(tmp_path).values()]
     assert 0 < len(sizes) < FRAMES / 2 and sum(sizes) <= 60_000
 
 
 @pytest.mark.parametrize("restarted", [False, True])
-def test_a_seed_that_is_corrected_before_it_was_followed_is_followed_all_the_same(
+def test_seed_corrected_before_tracking_is_tracked(
         drive, tmp_path, monkeypatch, restarted):
-    """Also if the server was killed meanwhile, by the next one."""
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
-    with open_session(drive, tmp_path, detector=None) as made:
-        made.propose(in_process=True)
-        monkeypatch.setattr(made, "_start", lambda *_: None)  # it had no time
-        _, track = click(made)
+    with open_session(drive, tmp_path, detector=None) as session:
+        session.propose(in_process=True)
+        monkeypatch.setattr(session, "_start", lambda *_: None)  # it had no time
+        _, track = click(session)
         moved = [track.boxes[1].values[0] + 0.1, *track.boxes[1].values[1:]]
-        made.do({"do": "box", "track": track.id, "frame": 1, "box": moved})
-        assert len(made.state.tracks[track.id].boxes) < FRAMES - 1
+        session.do({"do": "box", "track": track.id, "frame": 1, "box": moved})
+        assert len(session.state.tracks[track.id].boxes) < FRAMES - 1
         if not restarted:
-            made.propose(in_process=True, again=False)
-            found = made.state.tracks[track.id]
+            session.propose(in_process=True, again=False)
+            found = session.state.tracks[track.id]
     if restarted:
         with open_session(drive, tmp_path, detector=None) as again:
             again.start_proposals()
@@ -235,67 +233,65 @@ def test_a_seed_that_is_corrected_before_it_was_followed_is_followed_all_the_sam
     assert [f for f, b in found.boxes.items() if b.kind == KEY] == [0, 1]
 
 
-def test_a_correction_that_is_undone_while_a_click_was_followed_leaves_it_followed(
-        made, monkeypatch):
+def test_undoing_a_correction_after_tracking_leaves_it_tracked(
+        session, monkeypatch):
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
-    made.propose(in_process=True)
-    begun, start = [], made._start
-    monkeypatch.setattr(made, "_start", lambda *asked: begun.append(asked))  # slowly
-    _, track = click(made)
-    made.do({"do": "box", "track": track.id, "frame": 1, "box": [
+    session.propose(in_process=True)
+    begun, start = [], session._start
+    monkeypatch.setattr(session, "_start", lambda *asked: begun.append(asked))  # slowly
+    _, track = click(session)
+    session.do({"do": "box", "track": track.id, "frame": 1, "box": [
         track.boxes[1].values[0] + 0.1, *track.boxes[1].values[1:]]})
     (_, work), = begun
     work()
-    extend_track = made.state.tracks[track.id]
+    extend_track = session.state.tracks[track.id]
     assert len(extend_track.boxes) >= FRAMES - 1 and not extend_track.nearby
-    monkeypatch.setattr(made, "_start", start)
+    monkeypatch.setattr(session, "_start", start)
     for back in ("undo", "redo"):
-        made.do({"do": back})
-        made.wait()
-        found = made.state.tracks[track.id]
+        session.do({"do": back})
+        session.wait()
+        found = session.state.tracks[track.id]
         assert found.boxes.keys() == extend_track.boxes.keys() and not found.nearby
 
 
 @pytest.mark.parametrize("verb", ["accept", "reopen"])
-def test_a_click_that_is_rejected_while_it_is_followed_is_followed_once_that_is_taken_back(
-        made, monkeypatch, verb):
+def test_click_rejected_while_tracking_is_tracked_once_restored(
+        session, monkeypatch, verb):
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
-    made.propose(in_process=True)
-    begun, start = [], made._start
-    monkeypatch.setattr(made, "_start", lambda *asked: begun.append(asked))  # slowly
-    _, track = click(made)
-    made.do({"do": "reject", "track": track.id})
+    session.propose(in_process=True)
+    begun, start = [], session._start
+    monkeypatch.setattr(session, "_start", lambda *asked: begun.append(asked))  # slowly
+    _, track = click(session)
+    session.do({"do": "reject", "track": track.id})
     (_, work), = begun
     work()
-    assert made.state.tracks[track.id].nearby
-    monkeypatch.setattr(made, "_start", start)
-    made.do({"do": verb, "track": track.id})
-    made.wait()
-    found = made.state.tracks[track.id]
+    assert session.state.tracks[track.id].nearby
+    monkeypatch.setattr(session, "_start", start)
+    session.do({"do": verb, "track": track.id})
+    session.wait()
+    found = session.state.tracks[track.id]
     assert len(found.boxes) >= FRAMES - 1 and not found.nearby
-    assert [number for _, number in made.state.seeds] == [track.id]
+    assert [number for _, number in session.state.seeds] == [track.id]
 
 
-def test_what_was_only_looked_at_by_the_server_is_nobodys_to_undo(made):
-    """The first proposals come when they come: they take nothing from redo, nor a seed with them
-    when they are undone."""
-    made.do({"do": "check", "frame": 1})
-    made.do({"do": "undo"})
-    made.propose(in_process=True)
-    assert not made.state.undo_stack
-    made.do({"do": "redo"})
-    assert made.state.checked == {1}
-    _, track = click(made)
-    made.do({"do": "undo"})
-    assert track.id not in made.state.tracks and made.state.checked == {1}
+def test_first_proposals_are_not_undoable(session):
+    session.do({"do": "check", "frame": 1})
+    session.do({"do": "undo"})
+    session.propose(in_process=True)
+    assert not session.state.undo_stack
+    session.do({"do": "redo"})
+    assert session.state.checked == {1}
+    _, track = click(session)
+    session.do({"do": "undo"})
+    assert track.id not in session.state.tracks and session.state.checked == {1}
 
 
-def test_the_survey_is_kept_over_a_restart_and_made_again_where_it_is_damaged(drive, tmp_path):
-    with open_session(drive, tmp_path, detector=None) as made:
-        made.propose(in_process=True)
+def test_survey_survives_a_restart_and_is_redone_if_damaged(drive, tmp_path):
+    with open_session(drive, tmp_path, detector=None) as session:
+        session.propose(in_process=True)
     folder, key = tmp_path / survey_cache.FOLDER, survey_cache.make_key(drive, None)
     surveys, _ = survey_cache.read(folder, key)
-    for old, new in zip(made.proposer.surveys, surveys, strict=True):
+    for old, new in zip(session.proposer.surveys, surveys, strict=True):
         for name in ("boxes", "images", "shapes"):
             assert np.array_equal(getattr(old, name), getattr(new, name))
         assert np.array_equal(old.detections.boxes, new.detections.boxes)
@@ -309,53 +305,54 @@ def test_the_survey_is_kept_over_a_restart_and_made_again_where_it_is_damaged(dr
         found, why = survey_cache.read(folder, key)
         assert found == [] and "damaged" in why
     with open_session(drive, tmp_path, detector=None) as again:
-        said = []
-        again.listeners.append(lambda event: said.append(event.get("error", "")))
+        messages = []
+        again.listeners.append(lambda event: messages.append(event.get("error", "")))
         assert again.has_proposals and again.proposer.surveys is None
         again.propose(in_process=True, again=False)
-        assert any("damaged" in line for line in said) and again.proposer.surveys is not None
+        assert any("damaged" in line for line in messages) and again.proposer.surveys is not None
     with open_session(drive, tmp_path, detector=None) as third:
         assert third.proposer.surveys is not None
         click(third)
         assert len(third.state.tracks) >= 1 and third.state.seeds
 
 
-def test_a_person_who_was_clicked_before_the_drive_was_looked_at_is_followed_then(made):
-    _, track = click(made)
+def test_person_clicked_before_the_survey_is_tracked_after_it(session):
+    _, track = click(session)
     assert len(track.boxes) == 1
-    made.propose(in_process=True)
-    extend_track = made.state.tracks[track.id]
+    session.propose(in_process=True)
+    extend_track = session.state.tracks[track.id]
     assert len(extend_track.boxes) >= FRAMES - 1 and extend_track.state == "accepted"
     key, = [f for f, b in extend_track.boxes.items() if b.kind == KEY]
     assert extend_track.boxes[key] == track.boxes[key]
 
 
-def test_proposing_again_changes_nothing_that_was_decided(made):
-    made.propose(in_process=True)
-    click(made)
-    waiting = [t for t in made.state.tracks.values() if t.state == PROPOSED]
+def test_proposing_again_keeps_decisions(session):
+    session.propose(in_process=True)
+    click(session)
+    waiting = [t for t in session.state.tracks.values() if t.state == PROPOSED]
     for track in waiting[::2]:
-        made.do({"do": "reject", "track": track.id})
-    before = made.state.tracks
-    made.propose(in_process=True)
-    assert made.state.tracks == before
+        session.do({"do": "reject", "track": track.id})
+    before = session.state.tracks
+    session.propose(in_process=True)
+    assert session.state.tracks == before
 
 
-def test_the_journal_of_proposals_is_replayed_without_looking_at_the_drive(made, drive, tmp_path):
-    made.propose(in_process=True)
-    click(made)
-    state = made.state
-    made.journal.close()
-    again = type(made)(drive, type(made.journal)(tmp_path, made.journal._header), detector=None)
+def test_journal_of_proposals_is_replayed_without_a_survey(session, drive, tmp_path):
+    session.propose(in_process=True)
+    click(session)
+    state = session.state
+    session.journal.close()
+    journal = type(session.journal)(tmp_path, session.journal._header)
+    again = type(session)(drive, journal, detector=None)
     assert again.state == state and again.has_proposals
 
 
-def test_the_annotator_ends_with_every_person_right_and_less_work(made):
-    made.propose(in_process=True)
-    done = Annotator(made).run()
-    truth = Truth(made)
+def test_annotator_gets_every_person_right_with_less_work(session):
+    session.propose(in_process=True)
+    done = Annotator(session).run()
+    truth = Truth(session)
     assert done["people"] == len(truth.people) > 0
-    accepted = [t for t in made.state.tracks.values() if t.state == "accepted"]
+    accepted = [t for t in session.state.tracks.values() if t.state == "accepted"]
     for boxes in truth.people.values():
         for f, true in boxes.items():
             assert any(f in t.boxes and is_right(np.array(t.boxes[f].values), true)
@@ -363,26 +360,26 @@ def test_the_annotator_ends_with_every_person_right_and_less_work(made):
     assert done["actions"] == sum(done["kinds"].values()) < done["by_hand"]
 
 
-def test_what_is_cancelled_while_it_waits_for_what_went_on_before_ends_at_once(made):
+def test_task_cancelled_while_waiting_ends_immediately(session):
     done, go_on = [], threading.Event()
-    made._start("first", go_on.wait)
-    made._start("second", lambda: done.append(made._report_progress(0)))
-    made.cancel()
+    session._start("first", go_on.wait)
+    session._start("second", lambda: done.append(session._report_progress(0)))
+    session.cancel()
     go_on.set()
-    made.wait()
-    made._start("third", lambda: done.append(made._report_progress(0)))
-    made.wait()
+    session.wait()
+    session._start("third", lambda: done.append(session._report_progress(0)))
+    session.wait()
     assert done == [False, True]
 
 
-def test_proposals_that_are_cancelled_write_nothing(made):
-    made.busy = {"what": "proposing", "done": 0, "of": FRAMES}
-    made.listeners.append(lambda event: made.cancel())
-    made.propose(in_process=True)
-    assert made.state == State() and made.proposer.surveys is None
+def test_cancelled_proposals_write_nothing(session):
+    session.busy = {"what": "proposing", "done": 0, "of": FRAMES}
+    session.listeners.append(lambda event: session.cancel())
+    session.propose(in_process=True)
+    assert session.state == State() and session.proposer.surveys is None
 
 
-def test_boxes_snap_to_what_is_there(drive):
+def test_boxes_snap_to_ground_and_cluster(drive):
     frame = drive.frames[0]
     truth, scan = frame.truth(), drive.load_scan(0)
     near = np.hypot(*truth.boxes[:, :2].T) < 20  # farther away little ground is seen

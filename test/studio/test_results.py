@@ -1,4 +1,4 @@
-"""Results to be looked at: what is missed and false, what a bag holds, pictures."""
+"""Results in view: missed and false boxes, results in bags, screenshots."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def truth(boxes, class_ids):
 
 
 def wrong(*arguments, **more):
-    """Rows that are missed, and false; every row must be counted once."""
+    """Return missed and false rows, and check that every row is counted once."""
     truth, found, least, *_ = arguments
     result = match_detections(*arguments, **more)
     hits = len(truth) - len(result["missed"]) - len(result["ignored_labels"])
@@ -55,7 +55,7 @@ def wrong(*arguments, **more):
     return {"missed": result["missed"], "false": result["false"]}
 
 
-def test_labels_found_as_they_are_leave_nothing_missed_or_false():
+def test_exact_detections_leave_nothing_missed_or_false():
     ids = [CAR, CAR, PEDESTRIAN]
     boxes = np.vstack([CARS, [[8.0, -3, -1, 0.6, 0.6, 1.7, 0]]])
     found = Detections.of(boxes, ids, [0.9, 0.4, 0.7])
@@ -64,20 +64,20 @@ def test_labels_found_as_they_are_leave_nothing_missed_or_false():
             "missed": [], "false": []}
 
 
-def test_a_score_below_the_least_is_as_if_it_were_not_there():
+def test_detection_below_the_minimum_score_is_ignored():
     found = Detections.of(CARS, CAR, [0.9, 0.4])
     assert wrong(truth(CARS, [CAR, CAR]), found, 0.5) == {"missed": [1], "false": []}
     assert wrong(truth(CARS[:1], [CAR]), found, 0.0) == {"missed": [], "false": [1]}
 
 
-def test_two_boxes_on_one_car_are_one_too_many_and_classes_do_not_mix():
+def test_second_box_on_a_car_and_wrong_class_are_false():
     found = Detections.of(np.vstack([CARS[:1], CARS[:1]]), CAR, [0.9, 0.8])
     assert wrong(truth(CARS[:1], [CAR]), found, 0.0)["false"] in ([0], [1])
     other = Detections.of(CARS[:1], PEDESTRIAN, 0.9)
     assert wrong(truth(CARS[:1], [CAR]), other, 0.0) == {"missed": [0], "false": [0]}
 
 
-def test_a_van_is_neither_missed_nor_makes_a_car_there_false():
+def test_van_is_neither_missed_nor_a_false_car():
     assert wrong(truth(CARS[:1], [VAN]), Detections.none(), 0.0) == {"missed": [], "false": []}
     found = Detections.of(CARS[:1], CAR, 0.9)
     assert wrong(truth(CARS[:1], [VAN]), found, 0.0) == {"missed": [], "false": []}
@@ -97,7 +97,7 @@ def test_every_label_and_detection_is_counted_once(labels, detections, classes):
                         [score / 4 for *_, score in detections]), 0.5, classes=classes)
 
 
-def test_what_a_source_cannot_detect_it_does_not_miss(drive_bag):
+def test_source_does_not_miss_classes_it_cannot_detect(drive_bag):
     frame = next(iter(open_recording(drive_bag)))
     blind = Source(lambda i, frame: Detections.none(), frozenset(["Pedestrian"]))
     layers = Results({"blind": blind}).layers(0, frame, 0.3)
@@ -105,7 +105,7 @@ def test_what_a_source_cannot_detect_it_does_not_miss(drive_bag):
     assert names == {"Pedestrian"} and layers["detections"] == {"blind": []}
 
 
-def test_the_ground_and_clusters_of_a_bag_without_them_are_our_own(drive_bag):
+def test_bag_without_ground_and_clusters_is_segmented(drive_bag):
     assert choose_points_topic(drive_bag) == "/points"
     drive = select_drive(open_recording(drive_bag))
     ours, theirs = segment_frame(drive.frames[1]), read_recorded_scan(drive.frames[1])
@@ -118,8 +118,7 @@ NUMBERS = st.lists(st.integers(-2**31, 2**31 - 1), min_size=1, max_size=6, uniqu
 
 
 @given(st.lists(NUMBERS, min_size=2, max_size=4), st.integers(1, 10**6))
-def test_no_two_trackers_have_a_track_of_the_same_id(trackers, far):
-    """Whatever they call them, also where one counts on from the other's numbers."""
+def test_tracks_of_different_trackers_have_distinct_ids(trackers, far):
     trackers[1] = [*{*trackers[1], *(n + far for n in trackers[0] if n + far < 2**31)}]
     made = [[t["id"] for t in tracks_to_json({0: marked(numbers)}, "/a/output/tracks", k)]
             for k, numbers in enumerate(trackers)]
@@ -129,7 +128,7 @@ def test_no_two_trackers_have_a_track_of_the_same_id(trackers, far):
     assert set(made[0]) >= {n for n in trackers[0] if n >= 0}
 
 
-def test_a_track_is_what_its_tracker_called_it_last():
+def test_track_has_the_last_class_of_its_tracker():
     first, then = marked([7]), replace(marked([7]), labels=["Cyclist"])
     track, = tracks_to_json({0: first, 1: then}, "/a/output/tracks", 0)
     assert track["class"] == "Cyclist" and len(track["boxes"]) == 2
@@ -141,7 +140,7 @@ def marked(numbers):
                          np.full(count, 0.5), np.array(numbers), [{}] * count)
 
 
-def test_tracks_of_all_trackers_in_a_bag_keep_apart(tmp_path):
+def test_tracks_of_all_trackers_in_a_bag_are_distinct(tmp_path):
     numbers = {"/a/tracker/output/tracks": [1, 7], "/b/tracker/output/tracks": [1, 5]}
     with BagWriter(tmp_path / "bag") as made:
         for topic, ids in numbers.items():
@@ -154,7 +153,7 @@ def test_tracks_of_all_trackers_in_a_bag_keep_apart(tmp_path):
     assert {t["source"] for t in found} == {"a", "b"}
 
 
-def test_sources_have_names_that_tell_them_apart():
+def test_sources_have_unique_short_names():
     paths = [Path(name) for name in ("fused", "robot/fused.json", "a/v4/best.safetensors",
                                      "b/v4/best.safetensors", "/out/data", "x/y.json", "x/y.onnx")]
     assert make_short_names(paths, ["data"]) == ["fused", "robot/fused", "a/v4/best", "b/v4/best",
@@ -162,7 +161,7 @@ def test_sources_have_names_that_tell_them_apart():
 
 
 def ended(word: str) -> bool:
-    """Whether soon no process has this in its command line."""
+    """Return True once no process has this in its command line, False after a timeout."""
     end = monotonic() + 60.0
     while monotonic() < end:
         if not any(word in line for line in map(command_line, Path("/proc").glob("[0-9]*"))):
@@ -178,14 +177,14 @@ def command_line(process: Path) -> str:
         return ""
 
 
-def test_result_files_that_are_not_there_are_named(tmp_path):
+def test_missing_result_folder_is_named(tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
         file_source(tmp_path / "none")
 
 
 @pytest.mark.skipif(find_browser() is None, reason="chromium is not installed")
-def test_a_screenshot_is_a_picture_of_the_page_and_leaves_no_browser_behind(drive_bag, tmp_path,
-                                                                            monkeypatch):
+def test_screenshot_shows_the_page_and_ends_the_browser(drive_bag, tmp_path,
+                                                        monkeypatch):
     import matplotlib.image
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "profiles"))
     (tmp_path / "profiles").mkdir()
@@ -200,15 +199,15 @@ def test_a_screenshot_is_a_picture_of_the_page_and_leaves_no_browser_behind(driv
     assert ended(str(tmp_path / "profiles"))
 
 
-def test_a_frame_that_is_not_there_is_said(drive_bag):
+def test_missing_frame_is_reported(drive_bag):
     result = CliRunner().invoke(cli, ["view", str(drive_bag), "--frame", "99", "--no-open"])
     assert isinstance(result.exception, InputError) and "no frame 99" in str(result.exception)
 
 
 @pytest.mark.parametrize("verb", ["view", "label"])
 @pytest.mark.parametrize("content", [b"no cloud\n", b"", b"# .PCD v0.7\nDATA ascii\n"])
-def test_a_file_without_a_cloud_is_refused_before_a_page_is_served(verb, content, tmp_path,
-                                                                   monkeypatch, capsys):
+def test_file_without_a_cloud_is_refused_before_serving(verb, content, tmp_path,
+                                                        monkeypatch, capsys):
     file = tmp_path / "text.pcd"
     file.write_bytes(content)
     monkeypatch.chdir(tmp_path)

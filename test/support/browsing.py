@@ -15,7 +15,7 @@ FLAGS = ("--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic 
 
 @contextmanager
 def browsing() -> Iterator:
-    """Playwright's browser, without a window; where there is none, the test is skipped."""
+    """Start a headless browser with Playwright; skip the test if there is none."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     if (path := find_browser()) is None:
         pytest.skip("chromium is not installed")

@@ -1,4 +1,4 @@
-"""What the tests of the page do with it: look at a person, click, drag; ask the server."""
+"""Helpers for tests of the page: run a server, click, drag, read the state."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ PATIENCE = 60.0  # seconds
 NEAR = 20.0      # metres
 
 
-def labelled_person(frame) -> np.ndarray:
-    """(7,) the labelled person with most points within NEAR."""
+def find_nearest_person(frame) -> np.ndarray:
+    """Return the box (7,) of the labelled person within NEAR with the most points."""
     cloud = frame.load().xyz
     boxes = [b for b in frame.truth().of_class(PEDESTRIAN) if math.hypot(b[0], b[1]) < NEAR]
     return max(boxes, key=lambda b: points_in_box(cloud, b).sum())
@@ -36,7 +36,7 @@ def labelled_person(frame) -> np.ndarray:
 
 @dataclass
 class Server:
-    """The process of a command, the address that it printed, and what it says of problems."""
+    """The process of a command, the address that it printed, and its error output."""
 
     process: multiprocessing.Process
     url: str
@@ -45,8 +45,8 @@ class Server:
 
 @contextmanager
 def serving(*arguments: object, before: Callable[[], None] = lambda: None) -> Iterator[Server]:
-    """label or view as a copy of this process, which has loaded what they need; before: what the
-    copy does first. It is killed in the end."""
+    """Run label or view in a fork of this process, which has loaded all modules.
+    before: called first in the fork."""
     (out, said), (errors, wrong) = os.pipe(), os.pipe()
     process = multiprocessing.get_context("fork").Process(
         target=_command, args=([str(a) for a in arguments], said, wrong, before))
@@ -64,7 +64,6 @@ def serving(*arguments: object, before: Callable[[], None] = lambda: None) -> It
 
 
 def _command(arguments: list[str], said: int, wrong: int, before: Callable[[], None]) -> None:
-    """In the copy."""
     sys.argv = ["lidar-perception", *arguments]
     sys.stdout, sys.stderr = open(said, "w", 1), open(wrong, "w", 1)
     before()
@@ -73,7 +72,7 @@ def _command(arguments: list[str], said: int, wrong: int, before: Callable[[], N
 
 @dataclass
 class Label:
-    """A running labelling, asked over HTTP beside the page."""
+    """A running label server, with HTTP access to its state."""
 
     process: multiprocessing.Process
     url: str
@@ -89,22 +88,22 @@ class Label:
         return {track["id"]: track for track in self.state()["tracks"]}
 
     def box(self, number: int) -> list[float]:
-        """Of a track in frame 0."""
+        """Return the box of a track in frame 0."""
         return boxes_of(self.tracks()[number])[0]
 
     def lines(self) -> list[dict]:
-        """Of the journal."""
+        """Return the lines of the journal."""
         return [json.loads(line) for line in (self.out / "journal.jsonl").read_text().splitlines()]
 
     def look_at(self, page, person: np.ndarray) -> None:
-        """From the side of the sensor; the person is in the middle of the view."""
+        """Centre the view on a person, from the side of the sensor."""
         x, y, z = map(float, person[:3])
         away = 5.0 / math.hypot(x, y)
         page.evaluate("([place, from]) => page.lookAt(place, from)",
                       [[x, y, z], [x - x * away, y - y * away, z + 1.5]])
 
     def seed(self, page, person: np.ndarray) -> int:
-        """Look at a person, click it as a seed; the track that it becomes."""
+        """Click a person as a seed; return the id of the new track."""
         before = set(self.tracks())
         self.look_at(page, person)
         page.keyboard.press("Escape")
@@ -118,8 +117,7 @@ class Label:
         return page.evaluate("page.store.selected")
 
     def chosen(self, page, person: np.ndarray) -> int:
-        """A track of a person, new for this test, selected and looked at, without going on to the
-        next after a decision."""
+        """Make and select a new track of a person; decisions do not go to the next track."""
         number = self.seed(page, person)
         page.uncheck("#advance")
         page.locator("#scene").focus()
@@ -128,7 +126,7 @@ class Label:
         return number
 
     def wait(self, page, number: int, true) -> None:
-        """Until something is true of a track at the server, and the page has heard of it."""
+        """Wait until a condition holds for a track, on the server and on the page."""
         end = monotonic() + PATIENCE
         while not true(self.tracks().get(number)):
             assert monotonic() < end, (self.tracks().get(number), self.lines()[-3:])
@@ -139,7 +137,7 @@ class Label:
 
 @contextmanager
 def opened(browser, url: str, before: Callable = lambda page: None) -> Iterator:
-    """A page at an address; before: what is done with it first."""
+    """Open an address in a new page. before: called with the page first."""
     context = browser.new_context(viewport={"width": 1280, "height": 720})
     page, wrong = context.new_page(), []
     page.set_default_timeout(60_000)
@@ -159,7 +157,7 @@ def boxes_of(track: dict) -> dict[int, list[float]]:
 
 
 def faces(box: list[float]) -> dict[str, float]:
-    """How far each face is from the sensor's origin along its own outward axis."""
+    """Return the distance of each face from the origin along its outward axis."""
     x, y, z, *size, yaw = box
     cos, sin = math.cos(yaw), math.sin(yaw)
     along = cos * x + sin * y, -sin * x + cos * y, z
@@ -168,13 +166,13 @@ def faces(box: list[float]) -> dict[str, float]:
 
 
 def drawn(page) -> None:
-    """Wait until what the page knows by now is drawn, which on a busy machine takes a while."""
+    """Wait until the current state of the page is drawn."""
     page.evaluate("() => new Promise(done => requestAnimationFrame(() => "
                   "requestAnimationFrame(done)))")
 
 
 def middle(page, selector: str) -> tuple[float, float]:
-    """Of an element, on the page."""
+    """Return the centre of an element, in pixels of the page."""
     drawn(page)
     area = page.locator(selector).bounding_box()
     return area["x"] + area["width"] / 2, area["y"] + area["height"] / 2
