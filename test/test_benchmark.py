@@ -44,7 +44,7 @@ def nothing_installed(monkeypatch):
         monkeypatch.setitem(sys.modules, name, None)  # import fails as if it were not there
 
 
-def test_everything_is_called_in_turn_after_a_warm_up_that_is_not_timed():
+def test_contenders_run_in_turn_after_untimed_warm_up():
     called = []
     ms, results = interleaved({name: lambda name=name: called.append(name) or name.upper()
                                for name in "abc"}, 3)
@@ -76,7 +76,7 @@ def test_the_plain_euclidean_gives_our_clusters(threshold):
     np.testing.assert_array_equal(plain_euclidean.euclidean(cloud(), params), ours)
 
 
-def test_same_clusters_asks_for_the_same_noise_and_the_same_partition_of_core_points():
+def test_same_clusters_compares_noise_and_core_partition():
     core = np.array([True, True, True, False, False])
     ours = np.array([1, 1, 2, 2, 0])
     assert same_clusters(np.array([7, 7, 3, 7, 0]), ours, core)      # numbers, and a border point

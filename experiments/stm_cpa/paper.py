@@ -28,14 +28,14 @@ TABLE_4: dict[str, dict[str, Scores]] = {
     "60+": {"stage1": (0.0, 0.0, 0.0, None, None)},
 }
 
-# Table 5: CPA over 15 to 60 m with 0 to 8 steps, the same columns.
+# Table 5: CPA at 15 to 60 m with 0 to 8 steps, same columns.
 TABLE_5 = (
     (44.7, 60.5, 51.4, 80.6, 0.14), (46.4, 56.6, 51.0, 83.1, 0.14), (46.9, 52.8, 49.7, 85.8, 0.12),
     (47.9, 50.3, 49.1, 86.1, 0.14), (48.5, 47.2, 47.9, 86.7, 0.14), (48.6, 45.3, 46.9, 86.9, 0.14),
     (49.2, 43.1, 45.9, 87.8, 0.12), (49.5, 42.2, 45.6, 88.7, 0.14), (49.8, 41.1, 45.1, 88.8, 0.14),
 )
 
-# Figure 8 where the text or Table 4 gives a point: steps -> recall, precision, F1.
+# Points of Figure 8 given in the text or in Table 4: steps -> recall, precision, F1.
 FIGURE_8: dict[str, dict[int, Scores]] = {"15-30": {0: (24.7, 48.4, 32.7), 2: (None, None, 35.6)},
             "30-45": {0: (8.5, 22.1, 12.3)}, "45-60": {0: (0.8, 4.3, 1.4)}}
 

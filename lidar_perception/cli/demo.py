@@ -202,7 +202,10 @@ def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
 def _print_detections(frames: Sequence[RecordedResult], calibration: Any) -> dict:
     """Print and return the detection scores by class, for labels in the camera's view."""
     from lidar_perception.scoring.detections import FrameDetections
-    from lidar_perception.scoring.kitti.in_use import print_scores_at_threshold, score_at_threshold
+    from lidar_perception.scoring.kitti.default_threshold import (
+        print_scores_at_threshold,
+        score_at_threshold,
+    )
     from lidar_perception.scoring.kitti.report import DetectionReport
     report = DetectionReport()
     for frame in frames:

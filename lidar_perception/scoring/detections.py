@@ -1,4 +1,4 @@
-"""What a detector, or a file of its results, says of a frame, measured for any protocol."""
+"""Detections of a frame, from a detector or from result files, for any scoring protocol."""
 
 from __future__ import annotations
 
@@ -28,9 +28,16 @@ BoxesT = TypeVar("BoxesT", bound=Detections | GroundTruth)
 
 @dataclass(frozen=True)
 class FrameDetections(Generic[BoxesT]):
-    """One frame. detections: of a detector, or labels with a score in extras (a result file); ms:
-    of the detector, None where none ran; problem: why it refused the frame, whose objects are then
-    missed, or None. truth is None where the frame has no labels, calibration without a camera."""
+    """Detections and labels of one frame.
+
+    Attributes:
+        name: name of the frame.
+        truth: labels, or None.
+        detections: of a detector, or labels with a score in extras (result files).
+        calibration: None without a camera.
+        ms: duration of the detector, None for result files.
+        problem: why the detector rejected the frame, whose objects then count as missed, or None.
+    """
 
     name: str
     truth: GroundTruth | None
@@ -42,8 +49,10 @@ class FrameDetections(Generic[BoxesT]):
 
 def run_detector(detector: Detector, frame: Frame, truth: GroundTruth | None,
                  calibration: Calibration | None, keep: float = 1.0) -> FrameDetections[Detections]:
-    """Run a detector on a frame, of which it sees a share `keep` of the points. InputError where
-    the scan cannot be read."""
+    """Run a detector on a share `keep` of the points of a frame.
+
+    Raises InputError if the scan cannot be read.
+    """
     scan = thin_points(frame.load(), keep, frame.name)
     begin = perf_counter()
     try:
@@ -60,8 +69,12 @@ def run_detector(detector: Detector, frame: Frame, truth: GroundTruth | None,
 
 def measure_detector(open_: Callable[[], Detector], keep: float = 1.0, folder: Path | None = None
                      ) -> Start:
-    """Runs the detector that open_() gives on every frame with labels; with a folder on all frames,
-    and writes what it says there as KITTI result files. It sees a share `keep` of the points."""
+    """Make a Start that runs the detector of open_() on every labelled frame.
+
+    Args:
+        keep: share of the points that the detector gets, 0..1.
+        folder: also run on frames without labels, and write KITTI result files there.
+    """
     return partial(_measure_detector, open_, keep, folder)
 
 
@@ -79,7 +92,7 @@ def _measure_detector(
             try:
                 write_results(folder / f"{frame.name}.txt", result.detections,
                               choose_calibration(frame)[0])
-            except InputError as error:  # of the disk, or numbers that are not finite
+            except InputError as error:  # disk error, or values that are not finite
                 raise RunError(str(error)) from None
         return result
     return measure
@@ -87,9 +100,11 @@ def _measure_detector(
 
 def measure_result_files(folder: Path, recording: Recording
                          ) -> Callable[[Frame], FrameDetections[GroundTruth] | None]:
-    """Read KITTI result files, folder/NAME.txt, of every frame with labels. folder may be that of a
-    run of `detect`; frames that the run skipped are skipped. With a folder a Start of
-    scoring.run."""
+    """Make a function that reads the KITTI result file folder/NAME.txt of each labelled frame.
+
+    folder may be a run of `detect`; frames that the run skipped are skipped.
+    partial(measure_result_files, folder) is a Start of scoring.run.
+    """
     files = find_result_folder(folder)
     skipped = journal.read_skipped_frames(files.parent)
 

@@ -1,4 +1,4 @@
-"""Figures of Matplotlib as files."""
+"""Matplotlib figures as files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def save_picture(path: str | Path, figure: Figure, **options) -> None:
-    """Write a figure as PNG and close it. InputError where it cannot be written."""
+    """Write a figure as PNG and close it. Raise InputError if it cannot be written."""
     import matplotlib.pyplot as plt
     path = Path(path)
     try:

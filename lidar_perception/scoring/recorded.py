@@ -1,4 +1,4 @@
-"""What was recorded to a bag of a running graph: answers beside the labels of their frames."""
+"""Results that a running graph recorded to a bag, with the labels of their frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from msg_utils.markers import MarkedObjects, from_marker_array
 
 @dataclass(frozen=True)
 class RecordedResult:
-    """The labels of a frame, and what a node said of it."""
+    """Labels of one frame, and the objects that a node published for it."""
 
     stamp_ns: int
     truth: MarkedObjects
@@ -22,9 +22,13 @@ class RecordedResult:
 
 
 def read_results(path: Path, *topics: str) -> list[list[RecordedResult]]:
-    """For each of these topics of a bag, the labelled frames that have an answer on it, in order of
-    time; of equal stamps the last. Answers are in the frame of the labels; InputError where nothing
-    connects theirs with it."""
+    """Read the results of labelled frames from each of several topics, in order of time.
+
+    Results are in the frame of the labels. Of messages with equal stamps the last one counts.
+
+    Raises:
+        InputError: no transform connects the results with the labels.
+    """
     opened = BagHandle(path)
     found = read_objects_by_stamp(opened.bag(), (*topics, TRUTH))
     truth = found[TRUTH]
@@ -34,8 +38,10 @@ def read_results(path: Path, *topics: str) -> list[list[RecordedResult]]:
 
 
 def read_objects_by_stamp(bag: Bag, topics: Iterable[str]) -> dict[str, dict[int, MarkedObjects]]:
-    """By topic and header.stamp what is marked on MarkerArray topics of a bag; of equal stamps the
-    last. Nothing on a topic that the bag does not have."""
+    """Read the objects on MarkerArray topics by topic and header.stamp.
+
+    Of messages with equal stamps the last one counts. A topic that is not in the bag is empty.
+    """
     found: dict[str, dict[int, MarkedObjects]] = {topic: {} for topic in topics}
     for topic, _, message in bag.messages(found.keys() & bag.topics.keys()):
         objects = from_marker_array(message)

@@ -1,12 +1,11 @@
-"""The one loop over labelled frames: in this process, in many, or on the machines of a Dask
-cluster, in the order of the frames whatever is done where.
+"""Measurement of the frames of a recording, in one process, in several, or on a Dask cluster.
 
-    for name, result in results(recording, start, jobs=4): ...
+    for i, result in measure_frames(recording, start, jobs=4): ...
     fill(report, recording, start)          # update() with each result, skipped frames named
 
-start(recording) is called once in each process and gives measure(frame): what the frame says, any
-value that can be sent between processes, or None where it says nothing. InputError from measure, or
-from reading the frame in it, skips the frame.
+start(recording) is called once per process and returns measure(frame), which returns any picklable
+result, or None for a frame without one. InputError from measure, or from reading the frame in it,
+skips the frame. Results come in the order of the frames in all cases.
 """
 
 from __future__ import annotations
@@ -31,31 +30,39 @@ from lidar_perception.types import InputError, RunError
 
 Start = Callable[[Recording], Callable[[Frame], Any]]
 
-CONNECT_S = 20.0  # for a Dask scheduler to answer and a first worker to come
-TASKS_PER_THREAD = 2         # futures in flight for each thread of a Dask cluster
+CONNECT_S = 20.0  # timeout for a Dask scheduler and its first worker
+TASKS_PER_THREAD = 2         # on a Dask cluster
 
 
 class Report(Protocol):
-    """Collects what was measured. skipped: why frames do not count, a line each."""
+    """Collection of the results of frames; skipped has one line per skipped frame."""
 
     skipped: list[str]
 
     def update(self, result: Any) -> None:
-        """Add what measure() gave for one frame."""
+        """Add the result of one frame."""
 
     def compute(self) -> dict[str, Any]:
-        """All of it, as JSON can hold it."""
+        """Return the scores as a JSON object."""
 
 
 class Skipped(str):
-    """Why a frame could not be measured."""
+    """Reason why a frame was not measured."""
 
 
 def fill(report: Report, recording: Recording, start: Start, *, limit: int | None = None,
          jobs: int = 1, dask: str | None = None, title: str = "evaluating") -> None:
-    """Update a report with the first `limit` frames of a recording, or all, under a progress bar;
-    of all, labels whose scan is lost are skipped by name, too. InputError if a process or a cluster
-    fails."""
+    """Update a report with the results of a recording under a progress bar.
+
+    Skipped frames are added to report.skipped. Without a limit these include labels whose scan is
+    missing.
+
+    Args:
+        limit: number of frames to measure, None for all.
+
+    Raises:
+        InputError: a process or the cluster failed.
+    """
     count = min(len(recording), limit or len(recording))
     found = measure_frames(recording, start, range(count), jobs=jobs, dask=dask)
     with closing(found):
@@ -70,10 +77,18 @@ def fill(report: Report, recording: Recording, start: Start, *, limit: int | Non
 
 def fill_journal(journal: Journal, recording: Recording, start: Start, names: Sequence[str], *,
                  jobs: int = 1, dask: str | None = None, title: str) -> None:
-    """Measure the first frames of a recording, which have these names, and add each to the journal
-    as soon as it is done, unless it is there already. measure() gives a JSON object with the
-    frame's name under "frame"; of a frame that was skipped the journal has {"frame": name,
-    "skipped": reason}. InputError if a process or a cluster fails."""
+    """Measure frames and add each result to a journal as soon as it is complete.
+
+    Frames that are already in the journal are not measured again. measure() returns a JSON object
+    with the frame's name under "frame". A skipped frame is written as {"frame": name, "skipped":
+    reason}.
+
+    Args:
+        names: names of the first frames of the recording.
+
+    Raises:
+        InputError: a process or the cluster failed.
+    """
     missing = [i for i, name in enumerate(names) if name not in journal.lines]
     found = measure_frames(recording, start, missing, jobs=jobs, dask=dask)
     with closing(found):
@@ -84,12 +99,16 @@ def fill_journal(journal: Journal, recording: Recording, start: Start, names: Se
 
 def measure_frames(recording: Recording, start: Start, numbers: Sequence[int] | None = None, *,
                    jobs: int = 1, dask: str | None = None) -> Generator[tuple[int, Any]]:
-    """(i, what measure gave for frame i, or Skipped) of the frames with these numbers, ascending,
-    or of all, in their order.
+    """Yield (i, result of frame i, or Skipped) in the order of the frames.
 
-    jobs processes measure, or with dask the workers of the cluster whose scheduler has that
-    address; they need this package and see the recording under the same path. InputError if a
-    process or a cluster fails.
+    Args:
+        numbers: indices of the frames in ascending order, None for all.
+        jobs: number of processes.
+        dask: address of a Dask scheduler. Its workers need this package and the recording under the
+            same path.
+
+    Raises:
+        InputError: a process or the cluster failed.
     """
     numbers = range(len(recording)) if numbers is None else numbers
     if dask is not None:
@@ -102,7 +121,7 @@ def measure_frames(recording: Recording, start: Start, numbers: Sequence[int] | 
 
 def sort_results(pairs: Iterable[tuple[int, Any]], numbers: Sequence[int]
                  ) -> Generator[tuple[int, Any]]:
-    """The pairs (number, value) in the order of these numbers, each as soon as it can be."""
+    """Yield pairs (number, value) in the order of `numbers`, each as early as possible."""
     waiting: dict[int, Any] = {}
     wanted = iter(numbers)
     following = next(wanted, None)
@@ -140,8 +159,7 @@ def _require_reopen(recording: Recording) -> Callable[[], Recording]:
 
 
 def _make_worker(reopen: Callable[[], Recording], start: Start) -> Callable[[int], tuple[int, Any]]:
-    """What takes the number of a frame to what is measured of it, made in the process that will
-    use it: frames are not sent to another."""
+    """Return a function index -> (index, result), for use in the process that calls this."""
     recording = reopen()
     measure = start(recording)
     return lambda i: (i, _measure_safely(measure, recording.frames[i]))
@@ -153,7 +171,7 @@ _get_worker = functools.lru_cache(maxsize=1)(lambda run, reopen, start: _make_wo
 def _measure_on_cluster(
     run: str, reopen: Callable[[], Recording], start: Start, i: int
 ) -> tuple[int, Any]:
-    """As a worker, in a process that may serve other runs before and after."""
+    """Measure a frame in a process that other runs may share."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # for libraries that are loaded later
     with threadpool_limits(1):
         return _get_worker(run, reopen, start)(i)
@@ -161,12 +179,12 @@ def _measure_on_cluster(
 
 def _measure_on_dask(address: str, recording: Recording, start: Start,
                      numbers: Sequence[int]) -> Iterator[tuple[int, Any]]:
-    """As the workers of a Dask cluster finish them."""
+    """Yield results in the order in which the workers of a Dask cluster finish."""
     try:
         import distributed
         from distributed.comm import CommClosedError
     except ImportError:
-        raise InputError("--dask needs the package distributed; pip install "
+        raise InputError("--dask needs the package distributed; run pip install "
                          "'lidar_perception[distributed]'") from None
     work = functools.partial(_measure_on_cluster, uuid4().hex, _require_reopen(recording), start)
     try:
@@ -186,5 +204,5 @@ def _measure_on_dask(address: str, recording: Recording, start: Start,
                 for number in islice(waiting, 1):
                     running.add(client.submit(work, number, pure=False))
         except (distributed.KilledWorker, CommClosedError, CancelledError) as error:
-            raise InputError(f"the Dask cluster at {address} failed: {error}; what is done stays, "
-                             "the same command resumes") from None
+            raise InputError(f"the Dask cluster at {address} failed: {error}; finished frames are "
+                             "kept, and the same command resumes") from None

@@ -163,7 +163,7 @@ class Tty(io.StringIO):
         return True
 
 
-def test_info_folds_names_on_a_narrow_terminal_and_breaks_nothing_elsewhere(bag, monkeypatch):
+def test_info_folds_names_on_narrow_terminals_only(bag, monkeypatch):
     monkeypatch.setenv("COLUMNS", "60")
     with Bag(bag) as opened:
         topics, kinds = [*opened.topics], [*opened.topics.values()]
@@ -204,7 +204,7 @@ def test_info_as_json_has_what_the_table_has(bag, kitti):
     assert folder["first_cloud"]["labels"] == ["Pedestrian"]
 
 
-def test_what_is_wrong_in_a_bag_is_said_in_one_line_and_the_command_goes_on(bag, tmp_path):
+def test_bag_problem_is_one_line_and_command_continues(bag, tmp_path):
     shutil.copytree(bag, tmp_path / "bag")
     text = (bag / "metadata.yaml").read_text().replace("message_count: 2", "message_count: 9")
     (tmp_path / "bag/metadata.yaml").write_text(text)
@@ -387,7 +387,7 @@ def test_our_parameter_files_are_read_whatever_the_command(file, capsys):
     assert not capsys.readouterr().err
 
 
-def test_a_parameter_that_is_misspelt_is_said_and_those_of_others_are_not(tmp_path, capsys):
+def test_misspelt_parameter_is_reported(tmp_path, capsys):
     file = write(tmp_path / "p.yaml", "/**:\n  ros__parameters:\n    other: {ground: 1}\n"
                  "    input.ahead: 3.0\n    ground: {sensor_pose: {heigth: 0.6}}\n")
     assert read_config(file, PipelineParams()) == {}

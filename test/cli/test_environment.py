@@ -58,7 +58,7 @@ def test_a_reader_of_the_help_may_stop_reading():
 
 
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
-def test_of_two_first_calls_one_makes_the_environment_and_the_other_waits(tmp_path):
+def test_concurrent_first_calls_make_one_environment(tmp_path):
     venv = tmp_path / "venv"
     write(venv / "bin/lidar-perception", "#!/bin/sh\necho ran $1\n").chmod(0o755)
     with open(venv / "lidar-lock", "w") as lock:  # the one

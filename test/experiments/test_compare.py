@@ -111,7 +111,7 @@ def test_all_detectors_are_compared_and_what_is_missing_is_listed(bare, weights,
     assert max(map(len, lines)) <= 100 and "…" not in text
 
 
-def test_without_networks_the_candidates_are_compared_in_any_layout(bare, tmp_path):
+def test_candidates_are_compared_in_any_layout(bare, tmp_path):
     content, _ = run(tmp_path, "--data", tracking_folder(tmp_path / "kitti"), "--limit", 2,
                      "--png", tmp_path / "a.png")
     assert [*content["rows"]] == CANDIDATES and content["frames"] == 2
@@ -126,7 +126,7 @@ def test_without_networks_the_candidates_are_compared_in_any_layout(bare, tmp_pa
     assert whole >= cropped > [0, 0, 0]
 
 
-def test_a_detector_that_finds_everything_has_100_and_one_that_fails_goes_on(tmp_path):
+def test_perfect_detector_scores_100_and_failing_one_continues(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=3)
 
     def fails(frame):

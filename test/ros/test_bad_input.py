@@ -181,7 +181,7 @@ def test_clustering_and_refinement_name_the_missing_column(send, peer, good_clou
              f"a diagnostic of {node}")
 
 
-def test_without_camera_and_seed_the_diagnostics_say_so_and_a_click_helps(
+def test_diagnostics_report_missing_camera_and_seed(
         send, peer, good_cloud, drive_bag):
     """view.enabled without CameraInfo; then without a seed; then with a clicked pedestrian."""
     def said(words):

@@ -80,7 +80,7 @@ def test_a_cloud_of_a_moving_sensor_is_moved_to_its_stamp(start, source):
     assert make_time(START, bag_message).sec == after.header.stamp.sec and len(frame_)
 
 
-def test_the_first_cloud_waits_for_odometry_that_lags_behind_the_end_of_its_turn(start):
+def test_first_cloud_waits_for_odometry_of_its_whole_turn(start):
     rng = np.random.default_rng(0)
     xyz = (rng.uniform(-30, 30, (2000, 3)) * [1, 1, 0.001] - [0, 0, 1.8]).astype(np.float32)
     msg = message(xyz, t=np.linspace(0, 1e8, len(xyz)).astype("<u4"))
@@ -99,7 +99,7 @@ def test_the_first_cloud_waits_for_odometry_that_lags_behind_the_end_of_its_turn
 
 
 @pytest.mark.parametrize("first, begin, sectors", [(0.3, 0.0, ()), (1.0, -1.0, (120.0, 240.0))])
-def test_later_clouds_wait_for_the_end_of_their_turn_whatever_the_first_one_was(start, first, begin,
+def test_later_clouds_wait_for_the_end_of_their_turn(start, first, begin,
                                                                                 sectors):
     """A part of a turn, where the driver starts in the middle of one; or one that is stamped at its
     end, near which points are cropped. The odometry comes every 0.02 s."""

@@ -62,7 +62,7 @@ def drive(node, tell, poses, frame_id="lidar"):
 
 
 @pytest.mark.parametrize("source", ["odometry", "tf", "auto"])
-def test_a_sensor_that_is_mounted_anywhere_has_the_motion_of_its_place(start, source):
+def test_odometry_is_transformed_to_the_sensor(start, source):
     """By TF from what the odometry is of to the sensor, or all of it by TF."""
     node = start(TrackerNode, **{"ego.source": source})
     node.transforms.on_tf(transforms(("base", "lidar", SENSOR, 0)), static=True)
@@ -83,7 +83,7 @@ def test_detections_in_the_frame_of_the_odometry_do_not_move(start):
           np.tile(np.eye(4), (20, 1, 1)), "odom")
 
 
-def test_without_a_way_from_the_odometry_to_the_sensor_they_are_in_one_place_and_it_is_said(start):
+def test_missing_odometry_to_sensor_transform_is_reported(start):
     node = start(TrackerNode)
     drive(node, lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp)),
           [base_at(i) for i in range(10)])
@@ -103,7 +103,7 @@ def test_what_tf_lacks_is_named(start):
 
 
 @pytest.mark.parametrize("better", ["odometry", "tf"])
-def test_auto_takes_the_scans_after_a_second_without_poses_and_what_is_better_when_it_comes(
+def test_auto_falls_back_to_scans_and_returns_to_poses(
         start, better):
     if not has_odometry():
         pytest.skip("needs kiss-icp, the extra [odometry]")
@@ -139,7 +139,7 @@ def test_auto_takes_the_scans_after_a_second_without_poses_and_what_is_better_wh
     assert ICP_MS not in node.counts  # it costs nothing any more
 
 
-def test_in_a_detectors_process_a_cloud_waits_for_its_pose_and_not_for_ever(start):
+def test_detector_cloud_waits_for_its_pose_with_timeout(start):
     node = start(Perception, **{"tracking.enabled": True, "ego.max_wait": 100.0})
     deliver = node._receptions()[0].deliver
     xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
@@ -169,7 +169,7 @@ def test_an_empty_cloud_is_answered_and_the_scans_go_on(start):
     assert node.counts["ego"] == "kiss_icp" and node.outputs.final.tracks.ego.icp_restarts == 1
 
 
-def test_late_poses_hold_frames_up_for_max_wait_and_not_once_a_frame(start, monkeypatch):
+def test_late_poses_delay_frames_by_max_wait_once(start, monkeypatch):
     """A newer cloud takes the place of one that waits, so that none waits for long by itself."""
     node, now = start(TrackerNode), [100.0]
     monkeypatch.setattr(ego_module, "monotonic", lambda: now[0])
@@ -186,7 +186,7 @@ def test_late_poses_hold_frames_up_for_max_wait_and_not_once_a_frame(start, monk
     assert ego.find_missing_pose(header(START + TENTH)) is None and ego.late_since is None
 
 
-def test_odometry_of_another_clock_and_one_that_has_stopped_are_named(start, monkeypatch):
+def test_stopped_or_foreign_clock_odometry_is_reported(start, monkeypatch):
     node, now = start(TrackerNode), [100.0]
     for module in ego_module, transforms_module:
         monkeypatch.setattr(module, "monotonic", lambda: now[0])
@@ -221,7 +221,7 @@ def test_a_source_that_is_always_too_late_is_named(start, source, lag):
     assert node.counts["ego"] == source
 
 
-def test_of_two_odometries_on_a_topic_the_first_counts_while_it_comes_and_it_is_said(
+def test_first_of_two_odometry_publishers_is_used(
         start, monkeypatch):
     node, now = start(TrackerNode), [100.0]
     monkeypatch.setattr(transforms_module, "monotonic", lambda: now[0])
@@ -238,7 +238,7 @@ def test_of_two_odometries_on_a_topic_the_first_counts_while_it_comes_and_it_is_
     assert node.transforms.odometry_frame == "map" and not node.transforms.problems()
 
 
-def test_odometry_that_does_not_say_what_it_is_of_is_named_and_turns_no_cloud(start):
+def test_odometry_without_child_frame_is_ignored(start):
     node = start(TrackerNode)
     drive(node, lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp, "")),
           [base_at(i) for i in range(10)])
@@ -247,7 +247,7 @@ def test_odometry_that_does_not_say_what_it_is_of_is_named_and_turns_no_cloud(st
         node.transforms.sensor_poses("odometry", "lidar", np.array([START]))
 
 
-def test_poses_of_the_scans_are_carried_to_the_frame_of_the_detections(start):
+def test_scan_poses_are_converted_to_detection_frame(start):
     """Who looks to the rear goes backwards; without a way between the frames nothing is claimed."""
     if not has_odometry():
         pytest.skip("needs kiss-icp, the extra [odometry]")
@@ -269,7 +269,7 @@ def test_poses_of_the_scans_are_carried_to_the_frame_of_the_detections(start):
     assert ego.icp_restarts == 2
 
 
-def test_classes_of_other_stacks_are_known_and_those_that_are_not_are_named(start):
+def test_foreign_class_names_are_mapped_or_reported(start):
     found = next(crowd())
     there = make_detection_markers(found, header(START), bag_message)
     for marker in there.markers:

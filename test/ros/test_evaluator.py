@@ -28,7 +28,7 @@ def said(node):
 
 
 @pytest.mark.parametrize("late", [0, MAX_INCOMPLETE_FRAMES - 1, MAX_INCOMPLETE_FRAMES + 30])
-def test_labels_may_be_late_and_each_frame_that_is_given_up_is_counted_once(start, late):
+def test_labels_may_be_late_and_lost_frames_count_once(start, late):
     node, count = start(Evaluator), 300
     for i in range(count + late):
         if i < count:

@@ -90,7 +90,7 @@ def test_candidates_over_dds_are_those_of_the_offline_path(run, offline):
             np.testing.assert_array_equal(detections.class_ids, expected.class_ids)
 
 
-def test_the_published_cloud_holds_all_fields_and_the_offline_columns(run, offline, drive_bag):
+def test_published_cloud_has_all_fields_and_offline_columns(run, offline, drive_bag):
     single, _, out = run
     with Bag(drive_bag) as bag:
         sent = {to_point_cloud(m)[0].stamp_ns: m for _, _, m in bag.messages({POINTS})}

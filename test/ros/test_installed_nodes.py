@@ -92,7 +92,7 @@ def test_recorder_completes_its_bag(number, processes, peer, tmp_path):
     assert [path.name for path in tmp_path.glob("bag*")] == ["bag"]
 
 
-def test_entry_of_nodes_loads_no_library_before_signals_are_blocked():
+def test_node_entry_blocks_signals_before_loading_libraries():
     """A thread that one starts would not block them: of NumPy's OpenBLAS, for one."""
     code = ("import sys; before = {*sys.modules}; import lidar_perception.nodes.main, "
             "lidar_perception.cli.entry; print(*{n.partition('.')[0] for n in {*sys.modules} - "

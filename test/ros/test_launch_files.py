@@ -119,7 +119,7 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
         nodes(ahead="left")
 
 
-def test_ground_and_clusters_have_one_file_and_what_others_would_take_is_said(launched, tmp_path):
+def test_ground_and_cluster_file_rejects_other_arguments(launched, tmp_path):
     """That of the first detector, of the one that is named, or one of the user's."""
     _, nodes = launched("detectors")
     mine = tmp_path / "mine.yaml"
@@ -151,7 +151,7 @@ def test_ground_and_clusters_have_one_file_and_what_others_would_take_is_said(la
     assert "has no effect" in nodes.said[0]
 
 
-def test_users_file_is_above_the_packages_and_arguments_above_both(launched, tmp_path):
+def test_arguments_override_user_file_and_defaults(launched, tmp_path):
     """rcl prefers a section that names a node over /**, also an earlier one; ours are all /**."""
     for file in (ROOT / "config").glob("*.param.yaml"):
         assert list(read_sections(file)) == ["/**"]
@@ -281,7 +281,7 @@ def test_weights_device_and_range_of_a_detector_are_arguments(name, launched):
         assert started[f"{name}_detector"].parameters[1] == expected
 
 
-def test_a_replay_plays_to_the_nodes_that_its_player_and_evaluator_know(description, drive_bag):
+def test_replay_connects_player_nodes_and_evaluator(description, drive_bag):
     """Also where the file that includes it, or the command line, has arguments of these names."""
     actions = description("replay")
     pipeline = dict(next(a.launch_arguments for a in actions if hasattr(a, "launch_arguments")))

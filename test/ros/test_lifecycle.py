@@ -143,7 +143,7 @@ def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
     assert "Traceback" not in nodes.log(process)
 
 
-def test_a_node_that_nobody_asks_for_anything_says_so_while_there_is_input(here, peer, monkeypatch):
+def test_node_without_subscribers_reports_it(here, peer, monkeypatch):
     """As one that was started again behind a manager's back; not one that was asked to rest."""
     monkeypatch.setattr("lidar_perception.nodes.managed.MANAGER_TIMEOUT_S", 0.0)
     for kind, topic, sent in ((GroundSegmentation, "points", CLOUD),
@@ -195,7 +195,7 @@ def test_the_clock_of_a_simulation_goes_on_after_a_cleanup(here, peer):
                       == s * 10**9, "the time")
 
 
-def test_a_node_without_its_network_waits_for_the_file_and_says_so(nodes, peer, later, weights):
+def test_node_waits_for_missing_network_file(nodes, peer, later, weights):
     """A manager is refused, and the reason is an ERROR; once the file is there it is not refused,
     and a node that starts by itself takes it."""
     reason = f"there is no checkpoint {later}"
@@ -220,7 +220,7 @@ def test_a_node_without_its_network_waits_for_the_file_and_says_so(nodes, peer, 
     assert log.count(reason) == 1 and log.index(reason) < log.index(": ready")
 
 
-def test_a_template_that_is_missing_is_known_before_the_first_cloud(nodes, peer):
+def test_missing_template_is_reported_at_configure(nodes, peer):
     for name in ("waits/perception", "waits/candidate_refinement"):
         assert not change(peer, name, "configure")
         peer.wait_for_diagnostics(name, "/nowhere.json", level=2)
@@ -243,7 +243,7 @@ def test_an_activation_that_fails_is_said_and_tried_again(here, peer, monkeypatc
     assert node.state[1] == WAITING
 
 
-def test_what_waits_is_dropped_and_counted_and_the_pause_is_no_loss(here, peer, good_cloud):
+def test_waiting_clouds_are_dropped_without_counting_pause(here, peer, good_cloud):
     """sent = frames + dropped + lost holds over a pause, for what is sent while active."""
     node = here(GroundSegmentation, {"input.queue": 3}, {"~/input/points": "/in"})
     talker = peer.advertise("/in", CLOUD)

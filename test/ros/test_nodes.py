@@ -87,7 +87,7 @@ def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
 
 
 @pytest.mark.parametrize("kind", [GroundSegmentation, Perception])
-def test_every_parameter_is_answered_and_a_list_may_be_empty_and_full(start, kind):
+def test_every_parameter_is_readable_and_lists_may_be_empty(start, kind):
     """As ros2 param dump asks, and ros2 param set sets, where [] is a list of booleans."""
     node = start(kind)
     declared = parameter_names(node)
@@ -105,7 +105,7 @@ def test_every_parameter_is_answered_and_a_list_may_be_empty_and_full(start, kin
         assert list(node.get_parameter(p.name).value) == []
 
 
-def test_a_problem_whose_numbers_change_with_every_cloud_is_logged_once(start, monkeypatch):
+def test_problem_with_changing_numbers_is_logged_once(start, monkeypatch):
     """And that it is over, so that the log ends with how it is."""
     node, lines = start(GroundSegmentation), []
     monkeypatch.setattr(node, "_log", lambda level, message: lines.append((level, message)))
@@ -123,7 +123,7 @@ ARGUMENTS = {"-p foo": "-p foo", "--params-file /nope.yaml": "/nope.yaml",
              "stm.threshold", "-p bag:=7": "bag", f"-p bag:={300 * 'a'}": "File name too long"}
 
 
-def test_arguments_that_ros_does_not_take_are_one_line_and_exit_code_2(domain):
+def test_invalid_ros_arguments_exit_with_code_2(domain):
     """The line names the node as ROS does."""
     program = '''
 import sys
@@ -164,7 +164,7 @@ def test_bad_parameter_files_are_refused_in_one_line(processes):
         assert words in log and "Traceback" not in log
 
 
-def test_a_template_that_is_not_there_is_found_out_with_the_first_cloud(perception, shared_peer,
+def test_missing_template_is_reported_with_first_cloud(perception, shared_peer,
                                                                         talker, good_cloud):
     """A diagnostic, as the file may appear."""
     peer = shared_peer
@@ -189,7 +189,7 @@ def test_inputs_that_are_not_asked_for_change_nothing(perception, shared_peer, t
     assert "Error" not in perception.read_log("perception")
 
 
-def test_markers_that_go_away_are_deleted_and_time_that_jumps_back_is_noticed(
+def test_old_markers_are_deleted_and_time_jumps_noticed(
         perception, shared_peer, talker, good_cloud):
     peer, received = shared_peer, shared_peer.listen("/perception/output/boxes", MARKERS)
     peer.send(talker, good_cloud, lambda: received, "boxes")
@@ -203,7 +203,7 @@ def test_markers_that_go_away_are_deleted_and_time_that_jumps_back_is_noticed(
     peer.wait(lambda: "time jumped back" in perception.read_log("perception"), "the log line")
 
 
-def test_a_bag_that_starts_again_pairs_its_clouds_with_the_new_round():
+def test_restarted_bag_pairs_clouds_of_the_new_round():
     """Whichever comes first after the jump, nothing of the round before is given out."""
     for first in ("cloud", "partner"):
         delivered, dropped = [], []
@@ -245,7 +245,7 @@ def test_clouds_wait_for_the_partner_with_their_stamp():
     assert len(delivered) == 15 and all(p is None for _, p in delivered)
 
 
-def test_section_of_a_parameter_file_that_is_misspelt_is_said_by_its_node(processes, tmp_path):
+def test_misspelt_parameter_file_section_is_reported(processes, tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text("trackr: {ros__parameters: {autostart: false}}\n"
                     "controller_server: {ros__parameters: {autostart: false}}\n"

@@ -27,7 +27,7 @@ def pace_of(topics, ahead, timeout=10.0):
                        timeout)
 
 
-def test_never_more_clouds_ahead_than_allowed_and_each_is_accounted_for():
+def test_player_limits_clouds_in_flight():
     """With answers that come late, twice, or not at all."""
     rng = np.random.default_rng(0)
     for _ in range(100):
@@ -50,7 +50,7 @@ def test_never_more_clouds_ahead_than_allowed_and_each_is_accounted_for():
         assert answers and pace.unanswered <= 40 * len(topics)
 
 
-def test_an_answer_in_time_is_none_missed_and_a_later_one_says_that_none_will_come():
+def test_late_answer_counts_earlier_clouds_as_missed():
     pace = pace_of(["/a"], 2)
     for number in range(3):
         pace.add_cloud(b"\0" * 4 + stamp(number))
@@ -60,7 +60,7 @@ def test_an_answer_in_time_is_none_missed_and_a_later_one_says_that_none_will_co
     assert pace.unanswered == 1 and not pace.waiting
 
 
-def test_a_graph_that_never_answers_is_waited_for_once_and_then_briefly(monkeypatch):
+def test_silent_graph_is_awaited_once_then_briefly(monkeypatch):
     now = 0.0
     monkeypatch.setattr(pacing, "monotonic", lambda: now)
 

@@ -95,7 +95,7 @@ def test_a_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
     peer.wait(lambda: note, "the latched message")
 
 
-def test_of_static_transforms_all_hold_and_of_other_latched_topics_the_last(
+def test_static_transforms_accumulate_others_keep_last(
         monkeypatch, start, tmp_path):
     """Each node that publishes them sends its own, once."""
     from lidar_perception.nodes.replay import bag_player
@@ -159,7 +159,7 @@ def test_a_wrong_metadata_is_a_warning_and_the_bag_is_played(start, text_bag, tm
     assert capfd.readouterr().err.count(warning) == 1
 
 
-def test_a_topic_of_several_publishers_is_offered_as_the_best_of_them_did():
+def test_topic_of_several_publishers_offers_best_qos():
     from lidar_perception.nodes.replay.bag_player import _qos
 
     def profile(reliability, durability):
@@ -328,7 +328,7 @@ def test_the_recorder_has_what_each_of_several_publishers_latched(processes, pee
         assert sorted(m.data for _, _, m in bag.messages({"/note"})) == [*"012345"]
 
 
-def test_a_publisher_that_comes_later_and_offers_less_is_recorded_too(processes, peer, tmp_path):
+def test_late_publisher_with_weaker_qos_is_recorded(processes, peer, tmp_path):
     """Also by a name of the node's namespace."""
     first = peer.advertise("/robot/text", TEXT, RELIABLE)
     processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["text"]},
@@ -386,7 +386,7 @@ def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tm
     assert all(timer.clock.clock_type == ClockType.STEADY_TIME for timer in node.timers)
 
 
-def test_a_bag_of_one_message_in_a_loop_floods_nobody_and_hears_its_services(
+def test_looped_single_message_bag_does_not_flood(
         monkeypatch, tmp_path):
     from lidar_perception.nodes.replay import bag_player
     from lidar_perception.params import PlayerParams

@@ -206,7 +206,7 @@ def test_what_a_full_queue_has_pushed_out_was_not_lost_on_the_way():
     assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (2, 11, 16)
 
 
-def test_a_driver_that_starts_again_or_a_second_one_has_lost_nothing():
+def test_restarted_or_second_driver_loses_nothing():
     arrivals = Arrivals(5)
     for number in (7, 8, 1, 2):
         arrivals.add(infos([number]), 0)
@@ -252,7 +252,7 @@ def test_as_many_clouds_wait_at_the_middleware_as_may_wait(start):
         assert reception.subscription.qos_profile.depth == reception.arrivals.depth == depth
 
 
-def test_a_topic_that_is_not_latched_where_it_must_be_is_said_with_the_remedy(peer, start):
+def test_unlatched_topic_error_names_the_remedy(peer, start):
     node = start(GroundSegmentation)
     node.input("/static", TEXT, lambda _: None, LATCHED, private=False)
     peer.advertise("/static", TEXT, RELIABLE_QOS)
@@ -336,7 +336,7 @@ class Late:
 @pytest.mark.parametrize("given, learned, error, stale, lifetime", [
     (0.0, None, 2, 10, 2), (10.0, None, 2, 10, 2), (0.4, None, 7.5, 15, 6.25),
     (0.0, 0.4, 7.5, 15, 6.25), (10.0, 0.4, 2, 10, 2)])
-def test_a_slow_sensor_is_not_silent_between_two_clouds_and_its_boxes_stay(
+def test_slow_sensor_is_not_reported_silent(
         monkeypatch, given, learned, error, stale, lifetime):
     late = Late(monkeypatch, lambda stamp: 0.0, rate=given)
     late.reception.arrivals.learned, late.reception.last_time = learned, 1.0
@@ -358,7 +358,7 @@ def test_however_late_poses_are_clouds_are_answered_with_theirs(monkeypatch, lag
     assert stamps == sorted(stamps) and len(stamps) > 0.9 * 30 * rate
 
 
-def test_without_poses_clouds_are_used_as_they_are_and_with_them_again_when_they_come(monkeypatch):
+def test_clouds_without_poses_are_used_until_poses_return(monkeypatch):
     late = Late(monkeypatch, lambda stamp: 100.0 if 5 < stamp < 40 else 0.15, max_wait=2.0)
     late.run(60.0)
     assert not [s for s, _ in late.answered if 5.2 < s < 6.0]  # it waits for max_wait

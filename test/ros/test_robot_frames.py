@@ -195,7 +195,7 @@ def test_the_detectors_look_ahead_wherever_x_of_the_clouds_looks(start, weights,
         np.testing.assert_allclose(np.sin(turned), 0, atol=1e-2)
 
 
-def test_a_click_and_candidates_are_where_they_are_in_a_turned_cloud(start):
+def test_click_and_candidates_in_rotated_cloud(start):
     turn = mounted(0, 0, 0, np.radians(-100), 0, 0)
     node = start(Perception, **WALKING, **{"input.ahead": -100.0})
     xyz, person = transform_points(walker_scene()[:, :3].astype(np.float64), turn), WALKER[:3]
@@ -209,7 +209,7 @@ def test_a_click_and_candidates_are_where_they_are_in_a_turned_cloud(start):
     assert np.linalg.norm(detections.boxes[0, :2] - at[:2]) < 0.3
 
 
-def test_without_the_frames_the_parameters_stand_and_the_names_are_said(start):
+def test_missing_frames_are_named_and_parameters_used(start):
     """Columns and boxes are bit for bit those of a node that asks for no frame."""
     xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     plain = start(Perception)
@@ -230,7 +230,7 @@ def test_without_the_frames_the_parameters_stand_and_the_names_are_said(start):
     assert "odom" not in problems(asks)
 
 
-def test_the_body_is_cropped_only_where_the_frame_that_it_is_given_in_is_known(start):
+def test_body_crop_needs_a_known_frame(start):
     """Else it could be a person; and a body under the floor is said to be in another frame."""
     node = start(GroundSegmentation, base_frame="base", **{
         "crop.body": [-0.5, -0.4, 0.2, 0.5, 0.4, 1.0]})
@@ -251,7 +251,7 @@ def test_the_body_is_cropped_only_where_the_frame_that_it_is_given_in_is_known(s
     assert "crop.body ends 0.20 m below the ground of 'base'" in problems(low)
 
 
-def test_where_tf_does_not_connect_the_odometry_what_moves_is_listened_to(start):
+def test_odometry_without_tf_connection_is_still_used(start):
     node = start(GroundSegmentation, **{"input.deskew": "odometry"})
     for stamp in (START, START + PERIOD):
         node.transforms.on_odometry(odometry(np.eye(4), stamp, "base"))
@@ -260,14 +260,14 @@ def test_where_tf_does_not_connect_the_odometry_what_moves_is_listened_to(start)
     assert node.transforms._has_tf_subscription and "'lidar' is not in TF" in problems(node)
 
 
-def test_a_template_that_cannot_be_read_costs_the_candidates_alone(start):
+def test_unreadable_template_affects_candidates_only(start):
     node = start(Perception, **{"seed.source": "file"})
     assert node.set_parameters([Parameter("seed.file", value="/nowhere.npz")])[0].successful
     give(node, message(walker_scene()[:, :3]))
     assert len(boxes_of(node)[0]) == 0 and "/nowhere.npz" in node.state[1]
 
 
-def test_a_cloud_waits_for_a_transform_that_is_late_or_that_never_came(start):
+def test_cloud_waits_for_late_or_missing_transform(start):
     """Not for one that has stopped; nor where TF cannot be listened to."""
     xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     node = start(Perception, target_frame="odom")

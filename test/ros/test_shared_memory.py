@@ -65,7 +65,7 @@ def short():
         process.communicate("\n")
 
 
-def test_what_a_killed_process_left_in_shared_memory_goes_and_nothing_else(capsys):
+def test_only_shared_memory_of_killed_process_is_removed(capsys):
     with short() as killed, short() as living:
         theirs, others = segments(killed.pid), segments(living.pid)
 

@@ -119,7 +119,7 @@ def assert_tracked(frames, messages, poses, params):
     return shown
 
 
-def test_tracks_of_the_graph_are_those_of_the_library_and_end_with_the_loop(looped, drive_bag):
+def test_graph_tracks_equal_library_tracks_and_end_on_loop(looped, drive_bag):
     clouds, heard, diagnostics = looped
     poses = poses_of(drive_bag)
     stamps = [from_marker_array(m).stamp_ns for m in heard["found"]]
@@ -152,7 +152,7 @@ def test_in_one_process_with_the_detector_the_library_tracks_too(looped, drive_b
     assert any(t is not None and len(t) for t in shown)
 
 
-def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes, peer):
+def test_bad_frames_and_poses_are_reported(processes, peer):
     processes.start(NODE, REMAP, {})
     talker, tracks = peer.advertise("/found", MARKERS), peer.listen("/tracks", MARKERS)
     moving, now = peer.advertise("/moved", ODOMETRY_TYPE), START

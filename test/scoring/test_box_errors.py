@@ -46,7 +46,7 @@ def moved(boxes: np.ndarray, away=0.0, aside=0.0, **sizes) -> np.ndarray:
 
 @settings(max_examples=10)
 @given(st.integers(0, 2**32 - 1))
-def test_scores_that_are_the_share_of_right_boxes_are_reliable_and_others_are_not(seed):
+def test_scores_equal_to_share_of_right_boxes_are_reliable(seed):
     rng = np.random.default_rng(seed)
     true = cars(400, rng)
     true[:, :2] *= 20  # far apart
@@ -91,8 +91,8 @@ def test_errors_are_those_that_were_made():
 def test_what_is_put_right_counts_and_what_is_not_found_does_not():
     true = cars(12, np.random.default_rng(1))
     off = moved(true)
-    off[:4, 2] += 0.6    # in space only
-    off[4:8, :2] += 0.3  # from above as well
+    off[:4, 2] += 0.6    # 3D only
+    off[4:8, :2] += 0.3  # BEV and 3D
     found, scores = np.concatenate([off, off[:1] + [0, 200, 0, 0, 0, 0, 0]]), np.full(13, 0.9)
     scores[11] = 0.1     # too weak to count
     content = measure_box_errors([frame(true, found, scores)], "Car", 0.2)

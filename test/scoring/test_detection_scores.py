@@ -71,7 +71,7 @@ def car(kind="Car", left=500, top=150, bottom=210, z=20.0, x=0.0, occluded=0, tr
 
 
 REGION = "DontCare -1 -1 -10 {} 100 {} 250 -1 -1 -1 -1000 -1000 -1000 -10"
-WRONG = dict(left=900, z=40.0, x=10.0)  # another place, in the image and in space
+WRONG = dict(left=900, z=40.0, x=10.0)  # elsewhere in the image and in 3D
 
 
 def concatenate(*lines):
@@ -121,7 +121,7 @@ def test_average_precision_of_four_objects_worked_out_by_hand():
     assert aos["r40"] == pytest.approx(100 * (10 * 1 + 10 * 1.5 / 3 + 10 * 2.5 / 5) / 40)
 
 
-def test_average_precision_of_a_hundred_objects_worked_out_by_hand():
+def test_average_precision_equals_hand_computed_value():
     # 50 cars found, then 50 false ones, then the other 50 cars: precision 1 up to recall 1/2, and
     # at recall 1 it is 100 / 150, which is the best there is beyond 1/2.
     frames = [(car(), concatenate(car(score=0.9 - i * 1e-3), car(score=0.5 + i * 1e-4, **WRONG)))
@@ -177,7 +177,7 @@ def test_what_must_be_found(change, counted):
     assert tuple(rows[level]["objects"] if rows[level] else 0 for level in DIFFICULTIES) == counted
 
 
-def test_truncation_of_tracks_is_computed_and_their_level_is_no_share():
+def test_truncation_level_of_tracks_is_not_a_share():
     inside = np.array([20.0, 0, -0.9, 3.9, 1.6, 1.5, 0.2])
     across = np.array([7.0, 6.3, -0.9, 3.9, 1.6, 1.5, 0.2])
     share = project_boxes(across[None], CALIBRATION)[1][0]
@@ -265,7 +265,7 @@ def test_a_wrong_detection_of_lower_score_never_raises_ap(seed):
     assert all(a <= b for a, b in zip(after, before))
 
 
-def test_frames_one_by_one_are_the_frames_together_and_empty_ones_change_nothing():
+def test_report_is_independent_of_batches_and_empty_frames():
     rng = np.random.default_rng(5)
     frames = [reference.random_frame(rng) for _ in range(30)]
     there, back = (numbers(ap(f)) for f in (frames, [*frames[10:], ("", ""), *frames[:10]]))
@@ -288,7 +288,7 @@ def test_a_detection_without_an_angle_has_no_orientation_score():
     json.dumps(rows, allow_nan=False)
 
 
-def test_detections_are_projected_and_outside_the_image_they_do_not_count():
+def test_detections_outside_the_image_do_not_count():
     truth = labels(car())
     ahead, behind, beside = np.repeat(truth.boxes, 3, axis=0)
     behind[0], beside[1] = -20, 300
@@ -304,19 +304,19 @@ def test_detections_are_projected_and_outside_the_image_they_do_not_count():
 
 
 @pytest.mark.parametrize("broken", [dict(boxes=[[np.nan] * 7]), dict(scores=np.inf)])
-def test_a_number_that_is_not_finite_is_an_error_that_names_the_frame(broken):
+def test_error_about_non_finite_number_names_the_frame(broken):
     found = Detections.of(**{"boxes": labels(car()).boxes, "class_ids": 0, "scores": 1, **broken})
     with pytest.raises(InputError, match=r"^000123: .*box 1 of 1 .*not finite"):
         DetectionReport().update(FrameDetections("000123", labels(car()), found, CALIBRATION))
 
 
 @pytest.mark.parametrize("shift, taller, words", [
-    (0.62, 0, "0.62 m too high; check the height of the sensor"),
-    (-0.62, 0, "0.62 m too low; check the height"),
+    (0.62, 0, "0.62 m too high; check the sensor height"),
+    (-0.62, 0, "0.62 m too low; check the sensor"),
     (-0.75, 0, "0.75 m too low; that is half their height"),
     (0, 0, ""), (0.1, 0, ""), (0, 4.0, "0.00 m too high or too low, and 4.00 m too tall"),
 ])
-def test_boxes_that_are_right_from_above_but_not_in_space_are_noticed(shift, taller, words):
+def test_wrong_heights_are_diagnosed(shift, taller, words):
     total = DetectionReport()
     truth = labels(concatenate(*(car(left=100 * i, x=5.0 * i - 10) for i in range(5))))
     found = Detections.of(truth.boxes + [0, 0, shift, 0, 0, taller, 0], 0, np.arange(5) / 5)
@@ -328,7 +328,7 @@ def test_boxes_that_are_right_from_above_but_not_in_space_are_noticed(shift, tal
     assert content["ap"]["Car"]["bev"]["moderate"]["r40"] > 99
     if words:
         line, = content["diagnosis"]
-        assert line.startswith("Car: AP is 100.0 from above but 0.0 in space") and words in line
+        assert line.startswith("Car: AP is 100.0 in BEV but 0.0 in 3D") and words in line
     else:
         assert content["diagnosis"] == []
 
@@ -392,7 +392,7 @@ def test_thresholds_are_scores_of_hits_at_evenly_spaced_recall(seed, objects):
 
 
 @pytest.mark.parametrize("objects", [1, 2, 7, 40, 41, 1000])
-def test_a_curve_without_an_error_averages_to_100_where_the_program_cannot(objects):
+def test_perfect_curve_averages_to_100_with_few_objects(objects):
     thresholds = choose_thresholds(np.linspace(1, 0, objects), objects)
     right = np.ones(len(thresholds))
     assert average_curve(sample_curve(right, objects)) == pytest.approx((100, 100))

@@ -88,7 +88,7 @@ def test_the_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path,
     assert content["map_3d"] == {"r11": 100, "r40": 100} and content["ap"]["Cyclist"]["3d"][
         "easy"] is None
     assert content["pedestrian_centres"]["of_all"]["all"]["f1"] == 1
-    for words in ("Table 5", "67.09", "here, R40", "Pedestrians within 1.0 m", "from above"):
+    for words in ("Table 5", "67.09", "here, R40", "Pedestrians within 1.0 m", "BEV"):
         assert words in text
     assert max(map(len, text.splitlines())) <= 80
 
@@ -225,7 +225,7 @@ def test_frames_without_labels_are_written_and_not_scored(kitti, detector, tmp_p
     assert line == f"Error: {kitti}: no frame with labels"
 
 
-def test_a_scan_that_was_cut_is_skipped_and_one_that_is_refused_is_missed(kitti, detector,
+def test_truncated_scan_is_skipped_and_rejected_scan_missed(kitti, detector,
                                                                          tmp_path):
     write(kitti / "training/velodyne/000001.bin", b"123")
     content, text = evaluate(tmp_path, "--data", kitti, "--weights", "w")
@@ -322,7 +322,7 @@ def test_real_labels_as_their_own_results_score_100(data, tmp_path):
 
 
 @pytest.mark.no_cover
-def test_real_boxes_without_2d_boxes_are_projected_onto_the_labels(data, detector, tmp_path):
+def test_real_boxes_project_onto_their_2d_labels(data, detector, tmp_path):
     """Boxes, and nothing else, score 100 from above and in space. In the image a person's limbs
     and what hides him make his label differ from the projection of his box."""
     truths = iter([f.truth() for f in open_recording(data / "kitti_object")])

@@ -102,14 +102,14 @@ def test_two_pairs_are_better_than_one_perfect_pair():
     assert set(zip(*(x.tolist() for x in pairs))) == {(0, 1), (1, 0)}
 
 
-def test_exactly_the_maximal_distance_is_a_hit_in_three_dimensions():
+def test_maximum_distance_in_3d_is_a_hit():
     truth = boxes([10, 5, -1])
     for step in ([1, 0, 0], [0, -1, 0], [0, 0, 1]):
         assert len(match_centres(truth + [*step, 0, 0, 0, 0], truth)[0]) == 1
         assert len(match_centres(truth + [*np.multiply(step, 1.001), 0, 0, 0, 0], truth)[0]) == 0
 
 
-def test_detections_with_nan_or_infinite_centres_match_nothing_and_count_as_false():
+def test_detections_that_are_not_finite_are_false_positives():
     # Another node may send anything; one broken box must not stop the evaluation.
     truth = boxes([10, 0, 0], [20, 0, 0])
     found = boxes([np.nan, 0, 0], [20.1, 0, 0], [np.inf, 0, 0])
@@ -122,7 +122,7 @@ def test_detections_with_nan_or_infinite_centres_match_nothing_and_count_as_fals
 
 
 @given(seeds, st.lists(st.tuples(st.integers(0, 12), st.integers(0, 12)), max_size=4))
-def test_hits_and_misses_add_up_to_the_truth_and_to_what_was_found(seed, frames):
+def test_hits_misses_and_false_positives_add_up(seed, frames):
     rng = np.random.default_rng(seed)
     score, truths, found_count = Score(), [np.zeros((0, 7))], 0
     for found_in_frame, truth_in_frame in frames:
@@ -222,7 +222,7 @@ def run(frames, source="ground_truth"):
 HERE = (7.05, 0, -0.82)
 
 
-def test_the_report_of_a_recording_is_json_and_counts_every_labelled_pedestrian():
+def test_report_is_json_and_counts_every_pedestrian():
     content, found = run([
         frame("both", truth_of(HERE, (25, 9, -0.8))), frame("car", truth_of(HERE, label="Car")),
         frame("none", None), Frame("cut", 0, cut, lambda: truth_of(HERE)),

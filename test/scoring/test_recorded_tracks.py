@@ -45,7 +45,7 @@ def recorded(request, tmp_path):
     return tmp_path / "bag", request.param, message
 
 
-def test_recorded_tracks_are_counted_and_scored_where_labels_have_ids(recorded):
+def test_recorded_tracks_are_scored_if_labels_have_ids(recorded):
     path, with_ids, _ = recorded
     result = score_recorded_tracks(read_results(path, TRACKS)[0], None)
     assert result.count == {"Car": 2, "Cyclist": 1, "Pedestrian": 3}

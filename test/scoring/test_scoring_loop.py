@@ -56,7 +56,7 @@ def root(tmp_path):
     return root
 
 
-def test_in_many_processes_the_results_are_those_of_one_in_their_order(root):
+def test_results_are_equal_and_ordered_with_many_processes(root):
     recording = open_recording(root)
     one, two = ([*measure_frames(recording, counting, jobs=jobs)] for jobs in (1, 2))
     kinds = [type(result) for _, result in one]
@@ -78,7 +78,7 @@ def test_processes_measure_the_frames_of_a_split(root, tmp_path):
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_a_frame_that_cannot_be_read_is_skipped_by_name_and_the_others_go_on(root, jobs):
+def test_unreadable_frame_is_skipped_by_name(root, jobs):
     recording, report = open_recording(root), Names()
     fill(report, recording, counting, jobs=jobs)
     line, = report.skipped
@@ -87,7 +87,7 @@ def test_a_frame_that_cannot_be_read_is_skipped_by_name_and_the_others_go_on(roo
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_of_the_run_ends_it_and_what_came_before_has_counted(root, jobs):
+def test_run_error_ends_the_run_and_keeps_earlier_results(root, jobs):
     report = Names()
     with pytest.raises(InputError, match=r"^cannot go on after 000002$"):
         fill(report, open_recording(root), functools.partial(ending, "000002"), jobs=jobs)
@@ -128,7 +128,7 @@ def test_a_limit_is_of_frames_and_no_other_is_touched(root, limit, expected):
     assert touched == [f"00000{i}" for i in range(min(limit or COUNT, COUNT))]
 
 
-def test_start_is_called_once_and_each_frame_measured_once_when_it_is_asked_for(root):
+def test_start_and_each_measurement_run_once_and_lazily(root):
     called = []
 
     def start(recording):

@@ -91,7 +91,7 @@ def test_two_objects_in_one_cluster_are_both_under_segmented():
     assert content["under_segmentation"] == pytest.approx(2 / 3)
 
 
-def test_halves_of_an_object_and_two_objects_as_one_have_half_the_iou_and_are_no_hit():
+def test_half_and_merged_objects_are_no_hits():
     halves = report_of(np.repeat([1, 2], 20), objects(np.ones(40)))
     assert (halves["over_segmented"], halves["mean_pieces"], halves["under_segmented"]) == (1, 2, 0)
     both = report_of(np.ones(40), objects(np.repeat([1, 2], 20)))
@@ -125,7 +125,7 @@ def test_a_case_by_hand():
     assert (content["frames"], content["ms"], content["clusters_per_frame"]) == (1, 2.0, 4.0)
 
 
-def test_neutral_points_speak_neither_for_nor_against_their_own_object_only():
+def test_neutral_points_are_neutral_for_their_object_only():
     owner, region = np.repeat([1, 0, 2], [10, 10, 10]), np.repeat([1, 1, 2], [10, 10, 10])
     clean = score_clusters(np.repeat([1, 0, 2], [10, 10, 10]), objects(owner, region))
     with_road = score_clusters(np.repeat([1, 1, 2], [10, 10, 10]), objects(owner, region))
@@ -187,7 +187,7 @@ def column(x, y, z, count):
     return np.column_stack([np.full(count, x), np.full(count, y), np.linspace(*z, count)])
 
 
-def test_points_low_in_a_box_are_neutral_and_small_objects_are_left_out():
+def test_low_points_are_neutral_and_small_objects_ignored():
     xyz = np.concatenate([column(10, 0, (-1.65, -1.55), 5), column(10, 0, (-1.45, 0), 12),
                           column(20, 0, (-1.4, 0), 9), column(10, 1.1, (-1, 0), 3),
                           column(30, 0, (-1, 0), 4)]).astype(np.float32)
@@ -217,7 +217,7 @@ def test_dont_care_and_no_boxes_are_no_objects():
         assert found.classes == () and not found.owner.any() and not found.near.any()
 
 
-def test_instances_are_the_things_of_one_class_and_number_moving_or_not():
+def test_instances_include_moving_points():
     kinds = [(10, 5, 12), (252, 6, 10), (30, 5, 11), (10, 0, 20), (11, 1, 9), (50, 5, 30),
              (0, 5, 4), (1, 0, 4), (40, 0, 10)]
     counts = [count for _, _, count in kinds]
@@ -336,7 +336,7 @@ def run(*arguments):
     return CliRunner().invoke(segmentation, [str(a) for a in arguments])
 
 
-def test_the_command_scores_every_method_and_goes_on_after_a_broken_scan(tmp_path):
+def test_command_scores_every_method_and_skips_broken_scan(tmp_path):
     root = semantic_folder(tmp_path / "semantic")
     write(root / "sequences/00/labels/000001.label", b"")
     kitti = object_folder(tmp_path / "kitti", walker_label() + "\n")

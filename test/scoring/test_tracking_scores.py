@@ -113,7 +113,7 @@ def test_tracks_that_are_the_labels_score_one():
     assert score["sAMOTA"] == pytest.approx(score["AMOTP"], abs=1e-5)
 
 
-def test_two_ids_that_change_places_are_two_switches_and_cost_association_only():
+def test_swapped_ids_are_two_switches():
     score = scored(drive(switch_at=5))
     assert score["switches"] == 2 and score["DetA"] == pytest.approx(1.0)
     assert score["AssA"] == pytest.approx(1 / 3)  # each pair 5 of 10 + 10 - 5
@@ -162,7 +162,7 @@ def test_frames_whose_pose_is_not_known_are_counted_and_said(capsys):
         assert ("no pose: 2 of 3 frames" in said and "--ego kiss_icp" in said) == bool(unknown)
 
 
-def test_neighbour_classes_and_what_is_cut_off_neither_help_nor_harm():
+def test_neighbour_classes_and_truncated_labels_are_ignored():
     vans = drive(kind=VAN)
     assert scored(vans) is None
     cut = [(GroundTruth.of(t.boxes, t.class_ids, [{**e, "truncated": 2.0} for e in t.extras]), k)
@@ -186,7 +186,7 @@ def test_a_track_in_a_dont_care_region_is_excused():
     assert scored([(nothing, tracks)], calibration=FORWARD_CAMERA)["false"] == 2
 
 
-def test_without_tracks_all_is_missed_and_without_labels_all_is_false():
+def test_no_tracks_are_misses_and_no_labels_false_positives():
     nothing = GroundTruth.of([], [])
     missed = scored([(truth, nothing) for truth, _ in drive()])
     assert (missed["misses"], missed["HOTA"], missed["sAMOTA"]) == (20, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Detections to ground truth by centre distance (paper A, Section 3.8)."""
+"""Matching of detections and labels by centre distance (paper A, Section 3.8)."""
 
 from __future__ import annotations
 
@@ -12,16 +12,21 @@ MAX_CENTRE_DISTANCE = 1.0  # metres, Section 3.8
 
 def match_centres(found: np.ndarray, truth: np.ndarray,
                   max_distance: float = MAX_CENTRE_DISTANCE) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (P,), (P,) of row numbers of found (K, >=3) and truth (M, >=3) whose 3D centres are at
-    most max_distance apart, one to one: as many pairs as possible, then the least distance."""
+    """Match boxes one to one whose 3D centres are at most max_distance apart.
+
+    As many pairs as possible, then the least total distance. Returns the rows (P,) of found (K,
+    >=3) and of truth (M, >=3).
+    """
     distance = np.linalg.norm(found[:, None, :3].astype(float) - truth[None, :, :3], axis=2)
-    return assign_pairs(distance, distance <= max_distance)  # a centre that is NaN is far from all
+    return assign_pairs(distance, distance <= max_distance)  # NaN centres match nothing
 
 
 def assign_pairs(cost: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (P,) and columns (P,) of pairs for cost (K, M), none negative, of which only those
-    under allowed (K, M) bool can be: as many pairs as possible, then the least sum."""
-    # One forbidden pair costs more than all allowed ones together.
+    """Assign rows to columns of a non-negative cost (K, M) where allowed (K, M) bool.
+
+    As many pairs as possible, then the least total cost. Returns rows (P,) and columns (P,).
+    """
+    # a forbidden pair costs more than all allowed pairs together
     forbidden = cost[allowed].max(initial=0.0) * cost.size + 1.0
     rows, columns = linear_sum_assignment(np.where(allowed, cost, forbidden))
     keep = allowed[rows, columns]
@@ -29,16 +34,24 @@ def assign_pairs(cost: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def find_range_bins(boxes: np.ndarray) -> np.ndarray:
-    """(K,) index into RANGE_NAMES of the horizontal range of box centres (K, >=2)."""
+    """Return the index (K,) into RANGE_NAMES of the horizontal range of boxes (K, >=2)."""
     return np.searchsorted(RANGE_LIMITS, np.hypot(boxes[:, 0], boxes[:, 1]), side="right")
 
 
 def count_by_range(found: np.ndarray, truth: np.ndarray, pairs: tuple[np.ndarray, np.ndarray],
                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """True positives, false positives, misses (5,) int and summed centre errors (5,) metres of one
-    frame, by RANGE_NAMES: found boxes (K, 7), true boxes (M, 7), pairs of match_centres.
+    """Count the detections of one frame by RANGE_NAMES.
 
-    A true positive and a miss belong to the range of the true object, a false positive to its own.
+    A true positive and a miss belong to the range of the label, a false positive to its own.
+
+    Args:
+        found: (K, 7) detected boxes.
+        truth: (M, 7) labelled boxes.
+        pairs: result of match_centres.
+
+    Returns:
+        True positives, false positives, misses, each (5,) int, and summed centre errors (5,),
+        metres.
     """
     i, j = pairs
     true_bin, found_bin = find_range_bins(truth), find_range_bins(found)
@@ -51,21 +64,23 @@ def count_by_range(found: np.ndarray, truth: np.ndarray, pairs: tuple[np.ndarray
 
 
 class Score:
-    """Counts of one stage, by range: true and false positives, misses, centre errors."""
+    """Counts of one stage by range: true and false positives, misses, centre errors."""
 
     def __init__(self) -> None:
         self.tp, self.fp, self.fn = (np.zeros(len(RANGE_NAMES), int) for _ in range(3))
         self.error = np.zeros(len(RANGE_NAMES))
 
     def update(self, found: np.ndarray, truth: np.ndarray) -> None:
-        """One frame: found boxes (K, 7), true boxes (M, 7)."""
+        """Add one frame with detected boxes (K, 7) and labelled boxes (M, 7)."""
         counts = count_by_range(found, truth, match_centres(found, truth))
         for total, count in zip((self.tp, self.fp, self.fn, self.error), counts):
             total += count
 
     def table(self) -> dict[str, dict]:
-        """Range name (and 'all') to tp, fp, fn, precision, recall, f1, centre_error_m. A ratio
-        without cases is 0; centre_error_m is None without hits."""
+        """Return tp, fp, fn, precision, recall, f1 and centre_error_m by range name and for "all".
+
+        A ratio without cases is 0; centre_error_m is None without hits.
+        """
         rows = {name: self._row(i) for i, name in enumerate(RANGE_NAMES)}
         return {**rows, "all": self._row(slice(None))}
 

@@ -25,17 +25,20 @@ from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, find_r
 from lidar_perception.scoring.kitti.camera_objects import select_in_image
 from lidar_perception.types import PEDESTRIAN, GroundTruth, InputError
 
-MAX_TIMES = 10_000  # of a step that are kept
+MAX_TIMES = 10_000  # durations kept per step
 
 
 def select_pedestrians(truth: GroundTruth | None) -> np.ndarray:
-    """(M, 7) true Pedestrian boxes; none where there are no labels."""
+    """Return the Pedestrian boxes (M, 7) of labels, or of None."""
     return np.zeros((0, 7)) if truth is None else truth.of_class(PEDESTRIAN)
 
 
 def load_pedestrians(frame: Frame, view: bool = True) -> np.ndarray:
-    """(M, 7) true Pedestrian boxes of a frame; with view, where only the points in the camera's
-    view are looked at, those of which a part is in its image."""
+    """Load the Pedestrian boxes (M, 7) of a frame.
+
+    With view, where only points in the camera's view are used, boxes outside the image are left
+    out.
+    """
     truth = frame.truth()
     if view and truth is not None and len(select_pedestrians(truth)):
         truth = select_in_image(truth, frame.calibration())
@@ -44,8 +47,15 @@ def load_pedestrians(frame: Frame, view: bool = True) -> np.ndarray:
 
 @dataclass(frozen=True)
 class CandidateResult:
-    """One frame: true pedestrian boxes (M, 7), boxes (K, 7) by stage, time of each step, and why
-    there were none, or None; name: of the frame."""
+    """Candidates and labels of one frame.
+
+    Attributes:
+        truth: (M, 7) Pedestrian boxes.
+        boxes: (K, 7) by stage.
+        ms: duration of each step.
+        problem: why there are no candidates, or None.
+        name: name of the frame.
+    """
 
     truth: np.ndarray
     boxes: dict[str, np.ndarray]
@@ -56,8 +66,10 @@ class CandidateResult:
 
 def measure_candidates(params: PipelineParams, recording: Recording
                        ) -> Callable[[Frame], CandidateResult | None]:
-    """Runs the candidate pipeline on every frame with a pedestrian, as paper A does. With params a
-    Start of scoring.run."""
+    """Run the candidate pipeline on every frame with a pedestrian, as in paper A.
+
+    partial(measure_candidates, params) is a Start of scoring.run.
+    """
     warm_up()
     template = None if params.seed.source == "ground_truth" else load_seed(params.seed.file)
     return partial(measure_frame, params=params, template=template)
@@ -65,7 +77,10 @@ def measure_candidates(params: PipelineParams, recording: Recording
 
 def measure_frame(frame: Frame, params: PipelineParams,
                   template: Seed | None = None) -> CandidateResult | None:
-    """The pipeline on one frame, with the seed of seed_source(); None without a pedestrian."""
+    """Run the pipeline on one frame with the seed of make_seed_source().
+
+    Returns None for a frame without a pedestrian.
+    """
     truth = load_pedestrians(frame, params.view.enabled)
     if len(truth) == 0:
         return None
@@ -79,15 +94,18 @@ def measure_frame(frame: Frame, params: PipelineParams,
 
 
 def collect_boxes(candidates: Candidates) -> dict[str, np.ndarray]:
-    """Name of each stage to its boxes (K, 7)."""
+    """Return the boxes (K, 7) by stage."""
     return {stage: getattr(candidates, stage).boxes for stage in STAGES}
 
 
 def make_seed_source(
     truth: np.ndarray, template: Seed | None, params: PipelineParams
 ) -> SeedSource:
-    """Where a frame's seed comes from: its true pedestrians (M, 7) without a template, the paper's
-    protocol, else what params say."""
+    """Make the source of a frame's seed.
+
+    Without a template the seed is a true pedestrian, truth (M, 7), as in the paper; otherwise
+    params decide.
+    """
     if template is None:
         return make_truth_source(truth)
     if params.seed.source == "automatic":
@@ -97,9 +115,11 @@ def make_seed_source(
 
 @dataclass
 class CandidateReport:
-    """Scores of the stages over the frames with a pedestrian; times of the steps. It holds sums,
-    and the reasons of frames that were skipped, so it does not grow with the frames of a node that
-    runs for days; medians are of the last TIMES of each step."""
+    """Scores of the stages over frames with a pedestrian, and durations of the steps.
+
+    It keeps sums, reasons of skipped frames and the last MAX_TIMES durations of each step, so it
+    does not grow in a node that runs for days.
+    """
 
     frames: int = 0
     scores: dict[str, Score] = field(default_factory=dict)
@@ -109,12 +129,11 @@ class CandidateReport:
     most: tuple[int, str | None] = 0, None
 
     def find_most_crowded(self) -> str | None:
-        """Name of the frame with most pedestrians, the first of several, of those where nothing
-        was wrong; None without one."""
+        """Return the name of the first frame with most pedestrians, or None."""
         return self.most[1]
 
     def update(self, result: CandidateResult) -> None:
-        """One frame."""
+        """Add one frame."""
         if result.problem is not None:
             self.skipped.append(result.problem)
         self.frames += 1
@@ -127,12 +146,12 @@ class CandidateReport:
             self.update_times({**result.ms, "total": sum(result.ms.values())})
 
     def update_times(self, ms: dict[str, float]) -> None:
-        """Times of steps that come by themselves, as from the topics of nodes."""
+        """Add durations of steps that are measured separately, as by nodes."""
         for step, value in ms.items():
             self.times.setdefault(step, deque(maxlen=MAX_TIMES)).append(value)
 
     def compute(self) -> dict:
-        """What the JSON file holds."""
+        """Return the content of the JSON file."""
         return {
             "frames": self.frames,
             "ground_truth": int(self.true_by_range.sum()),

@@ -45,7 +45,7 @@ def print_candidate_report(content: dict, console: Console) -> None:
                       f"{error:.2f}", style="dim", end_section=True)
     console.print(table)
     if content["ms"]:
-        times = make_table("Median time a frame", "step", "ms", width=7)
+        times = make_table("Median duration per frame", "step", "ms", width=7)
         for step, ms in content["ms"].items():
             times.add_row(step, f"{ms:.2f}", style="bold" if step == "total" else "")
         console.print(times)

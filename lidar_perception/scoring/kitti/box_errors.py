@@ -1,4 +1,4 @@
-"""Where found boxes differ from the true ones, and what each difference costs."""
+"""Differences between detected and labelled boxes, and the effect of correcting each of them."""
 
 from __future__ import annotations
 
@@ -16,19 +16,23 @@ from lidar_perception.scoring.tables import make_table
 
 RANGES = (0.0, 15.0, 30.0, 45.0, np.inf)  # metres
 ERRORS = ("away", "aside", "bottom", "length", "width", "height", "yaw")
-# What is put right -> the columns of a box.
+# name of a correction -> columns of a box that are corrected
 CORRECTIONS = {"as it is": [], "z": [2], "x, y": [0, 1], "x, y, z": [0, 1, 2], "length": [3],
                "width": [4], "height": [5], "yaw": [6]}
 
 
 def measure_box_errors(frames: list[ComparedFrame], name: str, min_score: float) -> dict[str, Any]:
-    """Of the class called name, true boxes paired with the found box of min_score or more that
-    overlaps them most from above, if by more than the relaxed overlap of the class.
+    """Compare the labels of a class with the detections that overlap them most in BEV.
 
-    by_range: for each of RANGES and for all `pairs`, and of each error the `median` and the
-    `median_size`, m and rad: found minus true, centre along the ray from the sensor (away) and to
-    its left (aside), bottom, sizes; yaw modulo half a turn. strict: by what is put right (RIGHT),
-    the percentage of pairs beyond the strict overlap, in `space` and `above`. None without pairs.
+    Pairs need more than the relaxed overlap of the class, and detections at least min_score.
+
+    Returns:
+        by_range: for each of RANGES and for all: number of `pairs`, and of each error the `median`
+            and the `median_size` (of absolute values), m and rad. Errors are detected minus true:
+            centre along the ray from the sensor (away) and to its left (aside), bottom, sizes, and
+            yaw modulo half a turn.
+        strict: for each of CORRECTIONS the percentage of pairs beyond the strict overlap in 3D
+            (`space`) and BEV (`above`), None without pairs.
     """
     found, true = match_boxes(frames, name, min_score)
     differences, away = _compute_differences(found, true), horizontal_range(true)
@@ -57,7 +61,7 @@ def measure_box_errors(frames: list[ComparedFrame], name: str, min_score: float)
 
 
 def _compute_differences(found: np.ndarray, true: np.ndarray) -> dict[str, np.ndarray]:
-    """By ERRORS, (P,)."""
+    """Compute the differences (P,) by ERRORS."""
     azimuth = np.arctan2(true[:, 1], true[:, 0])
     x, y, z, *sizes, yaw = (found - true).T
     return dict(zip(ERRORS, (np.cos(azimuth) * x + np.sin(azimuth) * y,
@@ -67,7 +71,7 @@ def _compute_differences(found: np.ndarray, true: np.ndarray) -> dict[str, np.nd
 
 def _measure_overlaps(found: np.ndarray, true: np.ndarray, columns: list[int],
                       least: float) -> dict[str, float | None]:
-    """Percentage of pairs beyond the overlap, once these columns are the true ones."""
+    """Return the percentage of pairs above the overlap with these columns corrected."""
     if len(found) == 0:
         return {"space": None, "above": None}
     boxes = found.copy()
@@ -83,11 +87,11 @@ def _compute_median(values: np.ndarray) -> float | None:
 
 
 def print_box_errors(errors: dict[str, dict[str, Any]], console: Console) -> None:
-    """Two tables for each class with pairs."""
+    """Print two tables for each class with pairs."""
     for name, content in errors.items():
         if content["by_range"]["all"]["pairs"] == 0:
             continue
-        table = make_table(f"{name}: found minus true, median, and median of its size",
+        table = make_table(f"{name}: detected minus true, median, and median of absolute values",
                            "", "pairs", *ERRORS, width=6)
         for title, row in content["by_range"].items():
             table.add_row(
@@ -101,8 +105,8 @@ def print_box_errors(errors: dict[str, dict[str, Any]], console: Console) -> Non
                          "to its left.")
         console.print(table)
         table = make_table(f"{name}: pairs beyond the overlap {DETECTED[name].strict:g}, %",
-                           "put right", *CORRECTIONS, width=7)
-        for view, title in (("space", "in space"), ("above", "from above")):
+                           "corrected", *CORRECTIONS, width=7)
+        for view, title in (("space", "3D"), ("above", "BEV")):
             table.add_row(title, *(f"{row[view]:.0f}" for row in content["strict"].values()))
         console.print(table)
 

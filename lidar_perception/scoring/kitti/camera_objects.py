@@ -1,5 +1,4 @@
-"""Labels and detections as KITTI's benchmark compares them: upright in the camera's frame, with
-2D boxes, alpha, truncation and occlusion."""
+"""Labels and detections in the form that KITTI's benchmark compares."""
 
 from __future__ import annotations
 
@@ -13,22 +12,28 @@ from lidar_perception.data.kitti.write import project_boxes
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import Detections, GroundTruth, InputError, class_ids
 
-NO_ANGLE = -10.0          # KITTI's alpha where there is none
-# Truncation levels of the tracking layout: 0 inside, 1 across the border of the image, 2 ends of
-# tracks; of the raw one: 2 outside, 99 behind. From 2 on nobody is asked to find the object.
+NO_ANGLE = -10.0          # KITTI's value of an unknown alpha
+# Truncation levels of the tracking layout: 0 inside, 1 at the image border, 2 ends of tracks;
+# of the raw layout: 2 outside, 99 behind. Objects of level 2 or higher are ignored.
 IGNORED_LEVEL = 2
 
 
 @dataclass(frozen=True)
 class CameraObjects:
-    """K objects of one frame.
+    """K objects of one frame, upright in the camera's frame.
 
-    class_ids (K,) int32 into CLASSES. boxes (K, 7) float64 [x y z l w h yaw], metres: the camera's
-    frame with x forward, y left, z up (without a calibration the LiDAR's); sides of 0 where only a
-    2D box is known. image_boxes (K, 4) float64 [left top right bottom] pixels: 0 for an object
-    outside the image, endless without a calibration. alpha (K,) radians, NaN where unknown.
-    truncated (K,) 0..1, occluded (K,) int 0..3. scores (K,) float64, 1 for labels. regions (R, 4):
-    2D boxes of DontCare regions.
+    Attributes:
+        class_ids: (K,) int32 into CLASSES.
+        boxes: (K, 7) float64 [x y z l w h yaw], metres, in the camera's frame with x forward, y
+            left, z up (without a calibration the LiDAR's). Sizes are 0 where only a 2D box is
+            known.
+        image_boxes: (K, 4) float64 [left top right bottom] pixels; 0 for an object outside the
+            image, infinite without a calibration.
+        alpha: (K,) radians, NaN if unknown.
+        truncated: (K,) 0..1.
+        occluded: (K,) int 0..3.
+        scores: (K,) float64, 1 for labels.
+        regions: (R, 4) 2D boxes of DontCare regions.
     """
 
     class_ids: np.ndarray
@@ -45,42 +50,43 @@ class CameraObjects:
 
     @property
     def pixels_high(self) -> np.ndarray:
-        """(K,) float64 height of the 2D boxes."""
+        """Height (K,) float64 of the 2D boxes, pixels."""
         return self.image_boxes[:, 3] - self.image_boxes[:, 1]
 
     def take(self, indices: np.ndarray) -> CameraObjects:
-        """The objects at indices (M,), with all regions."""
+        """Return the objects at indices (M,), with all regions."""
         return CameraObjects(**{f.name: getattr(self, f.name).take(indices, axis=0)
                                 for f in fields(self) if f.name != "regions"},
                              regions=self.regions)
 
     @staticmethod
     def concatenate(parts: list[CameraObjects]) -> CameraObjects:
-        """The objects of one frame or more, behind one another."""
+        """Concatenate the objects of several frames."""
         return CameraObjects(*(np.concatenate([getattr(part, f.name) for part in parts])
                                for f in fields(CameraObjects)))
 
 
 def to_scored_labels(detections: Detections) -> GroundTruth:
-    """Detections as labels with a score."""
+    """Convert detections to labels with a score."""
     return GroundTruth.of(detections.boxes, detections.class_ids,
                           [{"score": float(score)} for score in detections.scores])
 
 
 def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> CameraObjects:
-    """Labels, or detections with their score in extras; notes come last.
+    """Convert labels, or detections with their score in extras. Notes (2D only) come last.
 
-    What a label file says is taken as it is; what it does not say (a 2D box, alpha) is computed
-    from the box. Truncation, too, is computed where the number is a level and no share, as in the
-    tracking and raw layouts: the share of the projected box that lies outside the image.
-    InputError where a box or a score is not finite.
+    Values that a label file contains are kept. Missing ones (2D box, alpha) are computed from the
+    box. Truncation is also computed where the number is a level and not a share, as in the tracking
+    and raw layouts: it is then the share of the projected box outside the image.
+
+    Raises InputError if a box or score is not finite.
     """
     scores = np.array([extra.get("score", 1.0) for extra in _list_extras(objects)])
     bad = ~np.isfinite(scores)
     bad[:len(objects)] |= ~np.isfinite(objects.boxes).all(axis=1)
     if bad.any():
         raise InputError(f"box {np.argmax(bad) + 1} of {len(bad)} or its score is not finite; a "
-                         "detector must leave such boxes out")
+                         "detector must not return such boxes")
     if calibration is None:
         return _make_without_camera(objects, scores[:len(objects)])
     labels = to_labels(objects, calibration.lidar_to_camera)
@@ -93,7 +99,7 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
     sides = np.maximum(_read_columns(labels, "dimensions", 3), 0)
     location, turn = _read_columns(labels, "location", 3), _read_columns(labels, "rotation_y")
     alpha = _read_columns(labels, "alpha")
-    whole = sides.all(axis=1)  # not a 2D box only
+    whole = sides.all(axis=1)  # not only a 2D box
     bearing = np.arctan2(location[:, 0], location[:, 2])
     computed = np.where(whole, wrap_angle(turn - bearing), np.nan)
     return CameraObjects(
@@ -119,8 +125,7 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
 
 
 def select_in_image(truth: GroundTruth, calibration: Calibration | None) -> GroundTruth:
-    """The labels of which a part is in the image; all without a calibration. KITTI has no others;
-    who labels all around has."""
+    """Return the labels that are partly in the image, or all without a calibration."""
     seen = np.flatnonzero(to_camera_objects(truth, calibration).pixels_high[:len(truth)] > 0)
     return GroundTruth.of(truth.boxes[seen], truth.class_ids[seen],
                           [truth.extras[i] for i in seen], truth.notes)

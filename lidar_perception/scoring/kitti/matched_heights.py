@@ -1,4 +1,4 @@
-"""How high found boxes hang beside the true ones, and when that explains a bad score in space."""
+"""Height errors of matched boxes, and the diagnosis of a low 3D AP that they explain."""
 
 from __future__ import annotations
 
@@ -7,18 +7,27 @@ import numpy as np
 from lidar_perception.scoring.kitti.protocol import METRICS, RELAXED, ComparedFrame
 from lidar_perception.types import CLASSES
 
-MIN_BEV_AP = 20.0     # percent AP from above from which the score in space is looked at
-MIN_AP_RATIO = 4   # times lower in space than from above: heights are off
+MIN_BEV_AP = 20.0     # percent; below this nothing is diagnosed
+MIN_AP_RATIO = 4   # of BEV to 3D AP from which on heights are wrong
 MAX_MEDIAN_ERROR = (
-    0.1  # metres of median error below which boxes are not too high or low as a whole
+    0.1  # metres; below this the median is not biased
 )
 
 
 def measure_heights(frames: list[ComparedFrame], name: str) -> dict:
-    """pairs: true objects of the class called name with the found box that overlaps them most from
-    above (relaxed overlap). z_error_m, abs_z_error_m: median height of the found centre above the
-    true one, and of its absolute value; height_error_m: median of found height minus true height;
-    height_m: median true height. None without pairs."""
+    """Measure the height errors of a class.
+
+    Each label is paired with the detection that overlaps it most in BEV, above the relaxed overlap.
+
+    Returns:
+        pairs: number of pairs.
+        z_error_m, abs_z_error_m: median height of the detected centre above the true one, and of
+            its absolute value.
+        height_error_m: median of detected minus true height.
+        height_m: median true height.
+
+    Medians are None without pairs.
+    """
     found, true = match_boxes(frames, name)
     z, taller, height = found[:, 2] - true[:, 2], found[:, 5] - true[:, 5], true[:, 5]
     rows = {"z_error_m": z, "abs_z_error_m": np.abs(z), "height_error_m": taller,
@@ -29,8 +38,11 @@ def measure_heights(frames: list[ComparedFrame], name: str) -> dict:
 
 def match_boxes(frames: list[ComparedFrame], name: str,
                 min_score: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 7) found boxes and the true ones of the class called name: for each true one the found
-    one, of min_score or more, that overlaps it most from above, if beyond the relaxed overlap."""
+    """Return the detected boxes (P, 7) and labelled boxes (P, 7) of a class that match.
+
+    Each label takes the detection of min_score or more that overlaps it most in BEV, if above the
+    relaxed overlap.
+    """
     class_id, pairs = CLASSES.index(name), []
     for frame in frames:
         found = np.flatnonzero((frame.found.class_ids == class_id)
@@ -46,14 +58,19 @@ def match_boxes(frames: list[ComparedFrame], name: str,
 
 
 def diagnose_heights(name: str, rows: dict, matched: dict) -> str:
-    """One line where the class called name is found from above but not in space, at the relaxed or
-    the strict overlap; else ''. rows: its part of the report; matched: of matched_heights."""
+    """Return one line if a class is detected in BEV but not in 3D, else "".
+
+    Args:
+        name: name of the class.
+        rows: its part of the report.
+        matched: result of measure_heights.
+    """
     for suffix in ("_relaxed", ""):
         bev, space = (rows[metric + suffix]["moderate"] for metric in ("bev", "3d"))
         if (matched["pairs"] and bev and bev["r40"] >= MIN_BEV_AP
                 and space["r40"] * MIN_AP_RATIO <= bev["r40"]):
-            return (f"{name}: AP is {bev['r40']:.1f} from above but {space['r40']:.1f} in space "
-                    f"(moderate, overlap {rows['bev' + suffix]['overlap']}): heights are off. "
+            return (f"{name}: AP is {bev['r40']:.1f} in BEV but {space['r40']:.1f} in 3D "
+                    f"(moderate, overlap {rows['bev' + suffix]['overlap']}): heights are wrong. "
                     + _describe_heights(matched))
     return ""
 
@@ -62,9 +79,9 @@ def _describe_heights(matched: dict) -> str:
     z, taller, height = (matched[key] for key in ("z_error_m", "height_error_m", "height_m"))
     boxes = f"the {matched['pairs']} matched boxes are"
     if abs(z) < MAX_MEDIAN_ERROR:
-        return (f"By the median {boxes} {matched['abs_z_error_m']:.2f} m too high or too low, and "
+        return (f"In the median {boxes} {matched['abs_z_error_m']:.2f} m too high or too low, and "
                 f"{abs(taller):.2f} m too {'tall' if taller > 0 else 'flat'}.")
-    reason = "check the height of the sensor, and the frame of the boxes."
+    reason = "check the sensor height and the frame of the boxes."
     if abs(abs(z) - height / 2) < MAX_MEDIAN_ERROR:
-        reason = "that is half their height: is z the bottom of a box and not its centre?"
-    return f"By the median {boxes} {abs(z):.2f} m too {'high' if z > 0 else 'low'}; {reason}"
+        reason = "that is half their height: z is probably the bottom of a box, not its centre."
+    return f"In the median {boxes} {abs(z):.2f} m too {'high' if z > 0 else 'low'}; {reason}"

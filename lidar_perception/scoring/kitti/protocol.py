@@ -1,12 +1,12 @@
-"""KITTI's object benchmark: which detection finds which object, and what counts.
+"""KITTI's object benchmark: matching of detections and labels, and average precision.
 
-Geiger, Lenz, Urtasun, CVPR 2012, and the benchmark's own program. For one class and difficulty an
-object is counted (it must be found), ignored (it may be found: too small in the image, hidden or
-cut off for the difficulty, or of a class like the wanted one) or other (as if it were not there).
-A detection is counted, or ignored where it is lower than the least height, of whatever class, or
-other. Detections are paired with objects twice: once by score, to learn at which scores recall
-rises, and once for each of these scores by overlap, to count. In the image alone a detection that
-lies in a DontCare region is not wrong; seen from above and in space such regions have no extent.
+Geiger, Lenz, Urtasun, CVPR 2012, and the benchmark's own program. For a class and a difficulty a
+label is counted (must be detected), ignored (may be detected: too small in the image, too occluded
+or truncated for the difficulty, or of a neighbour class) or other (has no effect). A detection is
+counted, ignored if it is lower than the minimum height, whatever its class, or other. Detections
+are matched twice: by score, to find the thresholds at which recall rises, and by overlap at each
+threshold, to count. A detection inside a DontCare region is not a false positive in the image; in
+BEV and 3D such regions have no extent.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from lidar_perception.types import CLASSES
 SCORED = tuple(DETECTED)
 NEIGHBOURS = {row.looks_like: row.name for row in TABLE if row.looks_like}
 METRICS = ("image", "bev", "3d")
-STRICT = {name: of.strict for name, of in DETECTED.items()}    # overlap needed for a hit
-RELAXED = {name: of.relaxed for name, of in DETECTED.items()}  # seen from above and in space
+STRICT = {name: of.strict for name, of in DETECTED.items()}    # overlap of a hit
+RELAXED = {name: of.relaxed for name, of in DETECTED.items()}  # in BEV and 3D
 DIFFICULTIES = ("easy", "moderate", "hard")
 MIN_PIXELS = (40, 25, 25)        # height of the 2D box
 MAX_OCCLUDED = (0, 1, 2)
@@ -41,8 +41,13 @@ COUNTED, IGNORED, OTHER = 0, 1, -1
 
 @dataclass(frozen=True)
 class ComparedFrame:
-    """M true and K found objects of one frame, found ones by falling score; overlaps (3, K, M)
-    float64 by METRICS; excused (K,) the largest share of a 2D box in a DontCare region."""
+    """M labels and K detections of one frame, detections by descending score.
+
+    Attributes:
+        true, found: labels and detections.
+        overlaps: (3, K, M) float64 by METRICS.
+        excused: (K,) largest share of a 2D box inside a DontCare region.
+    """
 
     true: CameraObjects
     found: CameraObjects
@@ -51,11 +56,11 @@ class ComparedFrame:
 
 
 def compare_objects(true: CameraObjects, found: CameraObjects) -> ComparedFrame:
-    """All overlaps of a frame. The order in which detections came makes no difference."""
+    """Compute the overlaps of a frame. The order of the detections does not matter."""
     found = found.take(np.lexsort([*found.boxes.T, *found.image_boxes.T, -found.scores]))
     shared = _intersect(found.image_boxes, true.image_boxes)
     own, others = _compute_areas(found.image_boxes), _compute_areas(true.image_boxes)
-    with np.errstate(invalid="ignore", divide="ignore"):  # a box without pixels shares none
+    with np.errstate(invalid="ignore", divide="ignore"):  # boxes without area overlap nothing
         image = np.nan_to_num(shared / (own[:, None] + others - shared))
         excused = np.nan_to_num(_intersect(found.image_boxes, true.regions) / own[:, None])
     overlaps = np.stack([image, *bev_and_3d_iou(found.boxes, true.boxes)])
@@ -67,7 +72,7 @@ def _compute_areas(boxes: np.ndarray) -> np.ndarray:
 
 
 def _intersect(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """(K, M) area that 2D boxes (K, 4) and (M, 4) share."""
+    """Compute the intersection area (K, M) of 2D boxes (K, 4) and (M, 4)."""
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
     return np.prod(np.maximum(high - low, 0), axis=2)
@@ -75,8 +80,15 @@ def _intersect(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All frames behind one another: true objects (M in all), found ones (K), overlaps (3, P) of
-    the pairs of each frame, found by true; first_* (F + 1,) int64 where each frame begins."""
+    """All frames concatenated.
+
+    Attributes:
+        true, found: labels (M) and detections (K) of all frames.
+        overlaps: (3, P) of the pairs of each frame, detections by labels.
+        excused: (K,) as in ComparedFrame.
+        first_true, first_found, first_pair: (F + 1,) int64 index of the first element of each
+            frame.
+    """
 
     true: CameraObjects
     found: CameraObjects
@@ -88,7 +100,7 @@ class Comparison:
 
     @staticmethod
     def of(frames: list[ComparedFrame]) -> Comparison:
-        """At least one frame."""
+        """Concatenate at least one frame."""
         true, found = [f.true for f in frames], [f.found for f in frames]
         return Comparison(
             CameraObjects.concatenate(true), CameraObjects.concatenate(found),
@@ -102,7 +114,7 @@ def _find_starts(sizes) -> np.ndarray:
 
 
 def classify_labels(objects: CameraObjects, name: str, difficulty: str) -> np.ndarray:
-    """(K,) int8 COUNTED, IGNORED or OTHER of labels, for the class called name."""
+    """Classify labels as COUNTED, IGNORED or OTHER, (K,) int8, for a class and difficulty."""
     level = DIFFICULTIES.index(difficulty)
     own = objects.class_ids == CLASSES.index(name)
     like = objects.class_ids == CLASSES.index(NEIGHBOURS.get(name, name))
@@ -113,7 +125,7 @@ def classify_labels(objects: CameraObjects, name: str, difficulty: str) -> np.nd
 
 
 def classify_detections(objects: CameraObjects, name: str, difficulty: str) -> np.ndarray:
-    """(K,) int8 COUNTED, IGNORED or OTHER of detections, for the class called name."""
+    """Classify detections as COUNTED, IGNORED or OTHER, (K,) int8."""
     low = objects.pixels_high < MIN_PIXELS[DIFFICULTIES.index(difficulty)]
     own = objects.class_ids == CLASSES.index(name)
     return np.where(low, IGNORED, np.where(own, COUNTED, OTHER)).astype(np.int8)
@@ -121,9 +133,14 @@ def classify_detections(objects: CameraObjects, name: str, difficulty: str) -> n
 
 @dataclass(frozen=True)
 class Precision:
-    """What was reached for one class, metric, overlap and difficulty: objects to find, and percent
-    at 11 and 40 recall points; the same for orientation (AOS); as KITTI's program gives them
-    where there are fewer objects than recall points."""
+    """Average precision in percent for one class, metric, overlap and difficulty.
+
+    Attributes:
+        objects: number of counted labels.
+        r11, r40: at 11 and 40 recall points.
+        aos_r11, aos_r40: the same for orientation (AOS).
+        official_r11, official_r40: as KITTI's program computes them for few objects.
+    """
 
     objects: int
     r11: float
@@ -136,8 +153,10 @@ class Precision:
 
 def compute_precision(frames: Comparison, name: str, metric: str, overlap: float,
                       difficulty: str) -> Precision | None:
-    """Average precision of the class called name at an overlap above the given one; None where
-    there is nothing to find. Orientation is NaN where a hit has no angle."""
+    """Compute the average precision of a class at an overlap above the given one.
+
+    Returns None without counted labels. Orientation is NaN if a hit has no angle.
+    """
     pairs = _collect_pairs(frames, name, metric, overlap, difficulty)
     objects = int((pairs[2] == COUNTED).sum())
     if objects == 0:
@@ -153,8 +172,10 @@ def compute_precision(frames: Comparison, name: str, metric: str, overlap: float
 
 def count_hits(frames: Comparison, name: str, metric: str, overlap: float, difficulty: str,
                thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two (T,) float64: how many detections of a score of thresholds (T,) or more are right, and
-    how many are wrong, by the rules of precision(); those that are ignored are neither."""
+    """Count right and wrong detections of at least each score of thresholds (T,), two (T,) float64.
+
+    The rules are those of compute_precision(); ignored detections are neither.
+    """
     pairs = _collect_pairs(frames, name, metric, overlap, difficulty)
     return _count(frames, pairs, metric, np.asarray(thresholds, np.float64))[:2]
 
@@ -162,7 +183,7 @@ def count_hits(frames: Comparison, name: str, metric: str, overlap: float, diffi
 def _collect_pairs(
     frames: Comparison, name: str, metric: str, overlap: float, difficulty: str
 ) -> tuple:
-    """What _hit_scores takes."""
+    """Return the arguments of _find_hit_scores."""
     return (frames.overlaps[METRICS.index(metric)], overlap,
             classify_labels(frames.true, name, difficulty),
             classify_detections(frames.found, name, difficulty),
@@ -170,7 +191,7 @@ def _collect_pairs(
 
 
 def _count(frames: Comparison, pairs: tuple, metric: str, thresholds: np.ndarray) -> tuple:
-    """What _counts gives of pairs at thresholds (T,)."""
+    """Call _count_hits with pairs at thresholds (T,)."""
     excused = (frames.excused if metric == "image" else np.zeros(len(frames.found))) > pairs[1]
     return _count_hits(*(*pairs, thresholds, excused, frames.true.alpha, frames.found.alpha))
 
@@ -186,8 +207,10 @@ def _find_hit_scores(
     first_found,
     first_pair,
 ):
-    """Scores of the detections that find a counted object, when every object takes the best scored
-    one that is left."""
+    """Return the scores of detections that hit a counted label.
+
+    Each label takes the unmatched detection with the highest score.
+    """
     hits, number = np.empty(len(scores)), 0
     taken = np.zeros(len(scores), np.bool_)
     for f in range(len(first_pair) - 1):
@@ -224,9 +247,11 @@ def _count_hits(
     true_alpha,
     found_alpha,
 ):
-    """(T,) float64 each: hits, wrong detections and summed similarity of angle of the hits, among
-    the detections that score each threshold or more, when every object takes the one of greatest
-    overlap that is left; an ignored one only where there is no other."""
+    """Count hits, wrong detections and summed angle similarity of hits at each threshold, (T,).
+
+    Each label takes the unmatched detection with the highest overlap, an ignored one only if there
+    is no other.
+    """
     hits, wrong, turned = (np.zeros(len(thresholds)), np.zeros(len(thresholds)),
                            np.zeros(len(thresholds)))
     taken = np.zeros(len(scores), np.int64)  # at which threshold, from 1

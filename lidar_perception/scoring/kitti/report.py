@@ -1,7 +1,4 @@
-"""Detections against labels: KITTI's average precision, and pedestrians by centre distance.
-
-update() adds a frame; compute() is what the JSON file holds.
-"""
+"""Scores of detections against labels: KITTI's average precision, and pedestrians by centre."""
 
 from __future__ import annotations
 
@@ -29,7 +26,7 @@ from lidar_perception.scoring.kitti.protocol import (
 )
 from lidar_perception.types import PEDESTRIAN, Detections, InputError
 
-# Row of the JSON file: metric and overlap.
+# row of the JSON file: metric and overlap
 ROWS = {"image": ("image", STRICT), "bev": ("bev", STRICT), "3d": ("3d", STRICT),
         "bev_relaxed": ("bev", RELAXED), "3d_relaxed": ("3d", RELAXED)}
 
@@ -38,8 +35,11 @@ INTERVALS = "bev_relaxed", "bev", "3d"
 
 @dataclass
 class DetectionReport:
-    """Frames, and what could not be scored; ms of the detector by frame, where it was run here.
-    follow: whether frames whose names say no drive follow each other, see intervals.blocks."""
+    """Frames to score, names of skipped frames, and durations of the detector.
+
+    follow is True if frames without a drive in their name are consecutive, see
+    intervals.group_frames.
+    """
 
     frames: list[ComparedFrame] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
@@ -50,12 +50,13 @@ class DetectionReport:
     follow: bool = False
 
     def update(self, result: FrameDetections) -> None:
-        """One frame, as detections.py measures it.
+        """Add one frame.
 
-        With a calibration, detections and labels outside the image are ignored, as KITTI's labels
-        end there. Without one there are no scores in the image, and the difficulty is that of
-        occlusion alone.
-        InputError, with the frame's name, for a number that is not finite.
+        With a calibration, detections and labels outside the image are ignored, as KITTI labels
+        nothing there. Without one there are no image scores, and difficulty depends on occlusion
+        only.
+
+        Raises InputError with the name of the frame for a number that is not finite.
         """
         if result.problem is not None:
             self.skipped.append(f"{result.name}: {result.problem}")
@@ -79,7 +80,7 @@ class DetectionReport:
                                 objects.scores[:len(found)][chosen], result.name)
 
     def compute(self) -> dict:
-        """What the JSON file holds; ap in percent."""
+        """Return the content of the JSON file; ap in percent."""
         result: dict[str, Any] = {
             "frames": len(self.frames), "ap": {}, "map_3d": None, "matched": {}, "diagnosis": [],
             "pedestrian_centres": self.pedestrians.compute(),
@@ -94,8 +95,10 @@ class DetectionReport:
         return result
 
     def intervals(self, count: int) -> dict[str, dict[str, list[float] | None]]:
-        """By class and row of INTERVALS, [low, high] of AP at R40, moderate, from `count` drawings
-        of the drives; see intervals.py. None without objects."""
+        """Return intervals [low, high] of AP (R40, moderate) by class and row of INTERVALS.
+
+        They come from `count` draws of the drives, see intervals.py. None without labels.
+        """
         found: dict[tuple[str, str], list[float | None]] = {
             (name, row): [] for name in SCORED for row in INTERVALS}
         for frames in draw_samples(group_frames(self.names, self.follow), count):
@@ -134,8 +137,10 @@ def _to_angle_content(value: Precision | None) -> dict | None:
 
 
 def average_3d(ap: dict) -> dict | None:
-    """r11 and r40: means of 3D AP over the classes and difficulties with objects, as the mAP of
-    the EG-PointPillars paper; None without objects."""
+    """Average 3D AP over classes and difficulties with labels, as in the EG-PointPillars paper.
+
+    Returns r11 and r40, or None without labels.
+    """
     rows = [row for name in SCORED for level in DIFFICULTIES if (row := ap[name]["3d"][level])]
     return {key: float(np.mean([row[key] for row in rows])) for key in ("r11", "r40")} if rows \
         else None

@@ -1,4 +1,4 @@
-"""Tables of detections against labels, beside the figures of the papers."""
+"""Tables of detections against labels, with the papers' results."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from lidar_perception.scoring.tables import (
     print_time,
 )
 
-# The EG-PointPillars paper, Table 5: AP in space at 0.7 (Car) and 0.5; easy, moderate, hard. It
-# does not say at how many recall points.
+# The EG-PointPillars paper, Table 5: 3D AP at 0.7 (Car) and 0.5; easy, moderate, hard. The number
+# of recall points is not given.
 COLUMNS = tuple(CLASSES[i] for i in (CAR, CYCLIST, PEDESTRIAN))
 PAPER = {
     "PointPillars": ((84.00, 72.89, 68.24), (80.57, 61.96, 58.32), (52.66, 47.09, 43.21)),
@@ -33,12 +33,12 @@ PAPER_MAP = {"PointPillars": 63.21, "V1": 65.00, "V2": 65.71, "V3": 65.18, "V4":
 # The STM-CPA paper, Tables 6 and 7: F1 of pedestrians within 1.0 m.
 CENTRE_F1 = {"STM-CPA": 0.521, "PointPillars": 0.52, "AVOD": 0.48, "PointCNN": 0.37,
              "F-PointNet": 0.33}
-TITLES = {"image": "2D box", "aos": "orientation", "bev": "from above", "3d": "in space",
-          "bev_relaxed": "from above", "3d_relaxed": "in space"}
+TITLES = {"image": "2D box", "aos": "orientation", "bev": "BEV", "3d": "3D",
+          "bev_relaxed": "BEV", "3d_relaxed": "3D"}
 
 
 def print_detection_report(content: dict, console: Console) -> None:
-    """Average precision by class and difficulty, the papers' figures, and what was noticed."""
+    """Print average precision by class and difficulty, the papers' results, and diagnoses."""
     _print_precision(content, console)
     _print_paper(content, console)
     _print_centres(content["pedestrian_centres"], console)
@@ -69,14 +69,14 @@ def _print_precision(content: dict, console: Console) -> None:
                     ),
                 )
         table.add_section()
-    table.caption = ("Beside the class: labels of each difficulty. * too few for KITTI's own "
-                     "sampling of recall, so read off the whole curve.")
+    table.caption = ("Next to the class: labels of each difficulty. * too few for KITTI's own "
+                     "sampling of recall; the whole curve is sampled.")
     console.print(table)
 
 
 def _print_paper(content: dict, console: Console) -> None:
     titles = [f"{name[:3]} {level[0].upper()}" for name in COLUMNS for level in DIFFICULTIES]
-    table = make_table("AP in space beside Table 5 of the EG-PointPillars paper", "", *titles,
+    table = make_table("3D AP and Table 5 of the EG-PointPillars paper", "", *titles,
                        "mAP", width=5)
     for key in ("r40", "r11"):
         cells = [_format_cell(level, key) for name in COLUMNS
@@ -88,12 +88,12 @@ def _print_paper(content: dict, console: Console) -> None:
         table.add_row(name, *(f"{v:.2f}" for levels in classes for v in levels),
                       f"{PAPER_MAP[name]:.2f}", style="dim")
     table.caption = ("Easy, moderate, hard; Car at overlap 0.7, the others at 0.5. The paper does "
-                     "not say whether at 11 or 40 recall points.")
+                     "not say whether it used 11 or 40 recall points.")
     console.print(table)
 
 
 def print_intervals(content: dict[str, dict], console: Console) -> None:
-    """Of AP, as DetectionReport.intervals gives them."""
+    """Print the intervals of AP that DetectionReport.intervals returns."""
     table = make_table(f"{INTERVAL_PERCENT} % intervals of AP (R40, moderate), drawn by drive", "",
                        *(TITLES[row] + overlap for row, overlap in zip(
                              INTERVALS, (", relaxed", "", ""))), width=10)

@@ -1,11 +1,10 @@
-"""The detection task of nuScenes: what is found by centre distance, how precise, how well placed.
+"""The detection task of nuScenes: average precision by centre distance, and errors of the hits.
 
-Caesar et al., CVPR 2020, Section 3.1, with the numbers of the configuration detection_cvpr_2019 of
-nuscenes-devkit. Detections of a class take, by falling score, the nearest object of their frame
-that is left, if it is near enough on the ground plane. Average precision is the area under the
-curve above a recall and a precision of 0.1, and is averaged over four distances. The errors of the
-true positives are those at 2 m: at every recall the mean over all hits of that score or more, and
-of these the mean above a recall of 0.1.
+Caesar et al., CVPR 2020, Section 3.1, with the configuration detection_cvpr_2019 of
+nuscenes-devkit. Detections of a class take, best score first, the nearest unmatched object of their
+frame if it is near enough in the ground plane. Average precision is the area under the curve above
+a recall and a precision of 0.1, averaged over four distances. The errors are those of hits at 2 m:
+at each recall the mean over all hits of at least that score, averaged over recalls above 0.1.
 """
 
 from __future__ import annotations
@@ -19,28 +18,31 @@ from numba import njit
 from lidar_perception.data.nuscenes.boxes import NAMES, GlobalBoxes
 from lidar_perception.geometry import points_in_box
 
-# Metres from the vehicle up to which a class counts.
+# maximum distance from the vehicle, metres
 RANGES = {"car": 50.0, "truck": 50.0, "bus": 50.0, "trailer": 50.0, "construction_vehicle": 50.0,
           "pedestrian": 40.0, "motorcycle": 40.0, "bicycle": 40.0, "traffic_cone": 30.0,
           "barrier": 30.0}
-DISTANCES = (0.5, 1.0, 2.0, 4.0)    # metres between centres, below which a detection is a hit
-ERROR_DISTANCE = 2.0                # of the hits whose errors are taken
+DISTANCES = (0.5, 1.0, 2.0, 4.0)    # of centres of a hit, metres
+ERROR_DISTANCE = 2.0                # of hits that errors are computed for
 RECALLS = np.linspace(0.0, 1.0, 101)
-FIRST_RECALL_INDEX = 11                   # the first of RECALLS above the least recall of 0.1
+FIRST_RECALL_INDEX = 11                   # of the first of RECALLS above 0.1
 MIN_PRECISION = 0.1
-MAP_WEIGHT = 5                       # of mAP in NDS, beside one for each of ERRORS
-RACK_CLASSES = ("bicycle", "motorcycle")  # not counted inside a bicycle rack
+MAP_WEIGHT = 5                       # weight of mAP in NDS; each of ERRORS has weight 1
+RACK_CLASSES = ("bicycle", "motorcycle")  # ignored inside a bicycle rack
 
 # translation m, scale 1 - IoU of the aligned boxes, orientation rad, velocity m/s, attribute
 # 1 - accuracy
 ERRORS = ("ate", "ase", "aoe", "ave", "aae")
 UNDEFINED = {"traffic_cone": ("aoe", "ave", "aae"), "barrier": ("ave", "aae")}
-SYMMETRIC_CLASSES = ("barrier",)           # look the same from both sides
+SYMMETRIC_CLASSES = ("barrier",)           # front and rear are equal
 
 
 def select_counted(boxes: GlobalBoxes, ego: np.ndarray, racks: GlobalBoxes) -> np.ndarray:
-    """(K,) bool of the labels or detections of one frame: those of a class, within its range of the
-    vehicle at ego (>=2,), not known to be without points, and no bicycle in a rack."""
+    """Return a mask (K,) of the labels or detections of one frame that count.
+
+    They are of a known class, within its range of the vehicle at ego (>=2,), not known to be
+    without points, and not a bicycle or motorcycle in a rack.
+    """
     ranges = np.array([RANGES[name] for name in NAMES] + [0.0])[boxes.class_ids]  # -1 is the last
     away = np.sqrt(((boxes.centres[:, :2] - ego[:2]) ** 2).sum(axis=1))
     kept = (away < ranges) & (boxes.points != 0)
@@ -52,9 +54,15 @@ def select_counted(boxes: GlobalBoxes, ego: np.ndarray, racks: GlobalBoxes) -> n
 
 @dataclass(frozen=True)
 class ClassScores:
-    """One class: objects to be found, detections, AP (0..1) at each of DISTANCES, and the five
-    errors, NaN where the class has none. Nothing found is AP 0 and errors 1, as is nothing to be
-    found."""
+    """Scores of one class.
+
+    Attributes:
+        objects, detections: counts.
+        ap: average precision 0..1 at each of DISTANCES.
+        errors: by ERRORS, NaN for errors that the class does not have.
+
+    Without a hit, or without an object, AP is 0 and the errors are 1.
+    """
 
     objects: int
     detections: int
@@ -68,8 +76,13 @@ class ClassScores:
 
 def score_class(name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: GlobalBoxes,
                 found_frames: np.ndarray) -> ClassScores:
-    """Scores of the class called name, over counted boxes of all frames: truth (M) and found (K),
-    with the numbers of their frames (M,), ascending, and (K,), int."""
+    """Score a class over the counted boxes of all frames.
+
+    Args:
+        name: name of the class.
+        truth, found: labels (M) and detections (K).
+        true_frames, found_frames: indices of their frames, (M,) ascending and (K,) int.
+    """
     own, own_found = (boxes.class_ids == NAMES.index(name) for boxes in (truth, found))
     truth, true_frames = truth[own], true_frames[own]
     found, found_frames = found[own_found], found_frames[own_found]
@@ -97,8 +110,10 @@ def score_class(name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: G
 
 @njit(cache=True, nogil=True)
 def _match(centres, frames, true_centres, first, most):
-    """(K,) int64 row of the object that each detection hits, -1 without one; detections by falling
-    score, objects of frame f in rows first[f] .. first[f + 1]."""
+    """Return the index (K,) int64 of the object that each detection hits, -1 without one.
+
+    Detections are sorted by descending score; objects of frame f are first[f] .. first[f + 1].
+    """
     indices, taken = np.full(len(centres), -1), np.zeros(len(true_centres), np.bool_)
     for i in range(len(centres)):
         best, least = -1, np.inf
@@ -115,8 +130,10 @@ def _match(centres, frames, true_centres, first, most):
 def _interpolate_curves(
     hit: np.ndarray, scores: np.ndarray, objects: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Precision and score (101,) at RECALLS, read off between the detections (K,), which come by
-    falling score; 0 at a recall that is not reached."""
+    """Interpolate precision and score at RECALLS, (101,) each, 0 at recall that is not reached.
+
+    Detections (K,) are sorted by descending score.
+    """
     if not hit.any():
         return np.zeros(len(RECALLS)), np.zeros(len(RECALLS))
     hits = np.cumsum(hit)
@@ -127,8 +144,11 @@ def _interpolate_curves(
 
 
 def _average_error(values: np.ndarray, scores: np.ndarray, confidence: np.ndarray) -> float:
-    """Mean of an error over the recalls that are reached, from FIRST_RECALL on, where at each the
-    error is the mean of all hits (H,) up to it; NaN are left out, and 1 is where all are."""
+    """Average an error over the recalls that are reached, from FIRST_RECALL_INDEX on.
+
+    The error at a recall is the mean over all hits (H,) up to it. NaN are ignored; 1 if all are
+    NaN.
+    """
     reached = np.flatnonzero(confidence)
     last = reached[-1] if len(reached) else 0
     if last < FIRST_RECALL_INDEX or np.isnan(values).all():
@@ -142,8 +162,11 @@ def _average_error(values: np.ndarray, scores: np.ndarray, confidence: np.ndarra
 def compute_errors(
     truth: GlobalBoxes, found: GlobalBoxes, half_turns: bool
 ) -> dict[str, np.ndarray]:
-    """The ERRORS (H,) float64 of pairs of boxes, NaN where the true velocity or attribute, or the
-    velocity found, is not known. With half_turns a box that is turned by pi is the same."""
+    """Compute the ERRORS (H,) float64 of pairs of boxes.
+
+    An error is NaN where the true velocity or attribute, or the detected velocity, is unknown. With
+    half_turns a box rotated by pi is the same.
+    """
     shared = np.minimum(truth.sizes, found.sizes).prod(axis=1)
     union = truth.sizes.prod(axis=1) + found.sizes.prod(axis=1) - shared
     period = np.pi if half_turns else 2 * np.pi
@@ -155,8 +178,11 @@ def compute_errors(
 
 
 def summarize(scores: dict[str, ClassScores]) -> dict[str, float]:
-    """map, the mean of each of ERRORS over the classes that have it, and nds, nuScenes' detection
-    score: the mean of mAP, five times, and of 1 - error, at least 0, for each error. 0..1."""
+    """Return map, the mean of each of ERRORS over its classes, and nds, all in 0..1.
+
+    nds is nuScenes' detection score, the mean of mAP with weight MAP_WEIGHT and 1 - error (at least
+    0) of each error.
+    """
     result = {"map": float(np.mean([s.mean_ap for s in scores.values()]))}
     for error in ERRORS:
         result[error] = float(np.nanmean([s.errors[error] for s in scores.values()]))

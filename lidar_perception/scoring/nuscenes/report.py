@@ -1,5 +1,4 @@
-"""Detections against the labels of nuScenes: update() adds a frame, compute() is what the JSON file
-holds."""
+"""Scores of detections against the labels of nuScenes."""
 
 from __future__ import annotations
 
@@ -28,8 +27,13 @@ DETECTED_NAMES = tuple(NAME_BY_CLASS.values())
 
 @dataclass(frozen=True)
 class KeyFrameResult:
-    """One key frame: boxes as a result file has them; truth and counted, labels and boxes that
-    count, None without labels; ms and problem as of Detected."""
+    """One key frame.
+
+    Attributes:
+        boxes: all boxes, as in a result file.
+        truth, counted: labels and boxes that count, None without labels.
+        ms, problem: see FrameDetections.
+    """
 
     token: str
     boxes: GlobalBoxes
@@ -41,7 +45,7 @@ class KeyFrameResult:
 
 def select_boxes(frame: Frame, boxes: GlobalBoxes, ms: float | None = None,
                  problem: str | None = None) -> KeyFrameResult:
-    """What counts of the boxes and of the labels of a frame of nuScenes."""
+    """Select the boxes and labels of a nuScenes frame that count."""
     key = frame.native
     labels = key.labels()
     if labels is None:
@@ -59,8 +63,10 @@ def select_boxes(frame: Frame, boxes: GlobalBoxes, ms: float | None = None,
 
 def measure_key_frames(open_: Callable[[], Detector], unlabelled: bool,
                        recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
-    """Runs the detector that open_() gives on every key frame with labels, with unlabelled on
-    all. All but the recording given, a Start of scoring.run."""
+    """Run the detector of open_() on every key frame with labels, or with unlabelled on all.
+
+    partial(measure_key_frames, open_, unlabelled) is a Start of scoring.run.
+    """
     detector = open_()
 
     def measure(frame: Frame) -> KeyFrameResult | None:
@@ -80,7 +86,10 @@ def measure_key_frames(open_: Callable[[], Detector], unlabelled: bool,
 def measure_result_file(
     path: Path, recording: Recording
 ) -> Callable[[Frame], KeyFrameResult | None]:
-    """Reads a result file of nuScenes' detection task. With a path a Start of scoring.run."""
+    """Read a result file of nuScenes' detection task.
+
+    partial(measure_result_file, path) is a Start of scoring.run.
+    """
     boxes = read_results(path, list(recording))
     return lambda frame: (None if frame.native.labels() is None
                           else select_boxes(frame, boxes[frame.name]))
@@ -88,8 +97,14 @@ def measure_result_file(
 
 @dataclass
 class NuscenesReport:
-    """Labels and detections that count, by frame, and what could not be scored; ms of the detector
-    by frame, where it was run here; boxes by sample token, for a result file."""
+    """Labels and detections that count.
+
+    Attributes:
+        truth, detections: by frame.
+        ms: durations of the detector, if it was run.
+        skipped: reasons of skipped frames.
+        boxes: by sample token, for a result file.
+    """
 
     truth: list[GlobalBoxes] = field(default_factory=list)
     detections: list[GlobalBoxes] = field(default_factory=list)
@@ -102,7 +117,7 @@ class NuscenesReport:
         return len(self.truth)
 
     def update(self, result: KeyFrameResult) -> None:
-        """One key frame."""
+        """Add one key frame."""
         self.boxes[result.token] = result.boxes
         if result.problem is not None:
             self.skipped.append(result.problem)
@@ -113,8 +128,11 @@ class NuscenesReport:
             self.detections.append(result.counted)
 
     def compute(self) -> dict:
-        """What the JSON file holds: ap, map and nds in percent. all: the mean over the ten classes,
-        as nuScenes ranks detectors; ours: over the three that the package's detectors know."""
+        """Return the content of the JSON file, with ap, map and nds in percent.
+
+        all is the mean over the ten classes, as in nuScenes' ranking; ours is the mean over the
+        three classes that the package's detectors know.
+        """
         result = {"frames": self.frames, "classes": {}, "all": None, "ours": None,
                   "ms": float(np.median(self.ms)) if self.ms else None, "skipped": self.skipped}
         if self.frames:

@@ -1,4 +1,4 @@
-"""The table of detections against the labels of nuScenes, beside a paper's figures."""
+"""Table of detections against the labels of nuScenes, with a paper's results."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from lidar_perception.scoring.nuscenes.protocol import DISTANCES, ERRORS
 from lidar_perception.scoring.nuscenes.report import DETECTED_NAMES
 from lidar_perception.scoring.tables import format_number, make_table, print_skipped, print_time
 
-# The improved-PointNet paper on nuScenes. It names neither the split nor the classes, and gives no
+# The improved-PointNet paper on nuScenes. It does not name the split or the classes, and gives no
 # AOE, AVE and AAE.
 PAPER = {"map": 92.68, "ate": 0.298, "ase": 0.218, "nds": 83.45}
 
 
 def print_nuscenes_report(content: dict, console: Console) -> None:
-    """AP at each distance and the errors, by class and over all, and what was left out."""
+    """Print AP at each distance and the errors, by class and overall."""
     table = make_table(f"nuScenes detection, {content['frames']} frames", "", "labels",
                        *(f"{d:g}m" for d in DISTANCES), "mAP", *(e.upper() for e in ERRORS),
                        "NDS", width=4)

@@ -1,4 +1,4 @@
-"""Tables of a cluster network's classes against labels."""
+"""Tables of the classes of a cluster network against labels."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from rich.console import Console
 
 from lidar_perception.scoring.tables import format_number, make_table, print_skipped
 
-# Paper C: segmentation on KITTI, in percent
+# Paper C: segmentation on KITTI, percent
 PAPER = {"accuracy": 94.96, "precision": 94.3, "recall": 93.5, "f1": 93.9, "iou": 92.12}
 
 
 def print_cluster_scores(content: dict[str, Any], out: Console) -> None:
-    """The confusion of clusters, and the paper's figures."""
+    """Print the confusion of clusters, and the paper's scores."""
     names = content["classes"]
     rows = content["clusters"]
     table = make_table(f"Clusters of {content['min_points']} points or more, "
@@ -40,9 +40,9 @@ def print_cluster_scores(content: dict[str, Any], out: Console) -> None:
         table.add_row(f"  {name}", "", *(_format_number(row[key]) for key in
                                          ("precision", "recall", "f1", "iou")))
     table.add_row(
-        "its paper, KITTI", *(_format_number(value) for value in PAPER.values()), style="dim"
+        "paper C, KITTI", *(_format_number(value) for value in PAPER.values()), style="dim"
     )
-    table.caption = "The paper does not say how it counts points."
+    table.caption = "The paper does not define how points are counted."
     out.print(table)
     print_skipped(content["skipped"], out)
 

@@ -1,4 +1,4 @@
-"""Which class clusters and their points are of, and how often a network says so (paper C)."""
+"""Class labels of clusters and of their points, and the confusion with a network (paper C)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from lidar_perception.ground.segment import segment_ground
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, GroundTruth
 
-UNKNOWN = -1              # a label of which nothing is said
+UNKNOWN = -1              # label of clusters and points that are not scored
 MIN_OBJECT_SHARE, MAX_BACKGROUND_SHARE = (
     0.5,
     0.15,
@@ -41,9 +41,20 @@ MIN_POINTS = 10         # clusters with fewer do not count
 
 def label_clusters(clusters: Clusters, boxes: np.ndarray, class_ids: np.ndarray,
                    classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """labels (K,) int64 of clusters into classes, their number for background, UNKNOWN for what is
-    neither; owners (K,) int64: which of boxes (M, 7), of class_ids (M,) into CLASSES, each is of,
-    -1 for none. Of several boxes the one with most of its points counts."""
+    """Label clusters by the boxes that contain them.
+
+    A cluster is labelled by the box with the largest share of its points.
+
+    Args:
+        clusters: K clusters.
+        boxes: (M, 7) labelled boxes.
+        class_ids: (M,) indices into CLASSES.
+        classes: names of the labels.
+
+    Returns:
+        Labels (K,) int64 into classes, len(classes) for background, UNKNOWN for neither; and the
+        index of the box (K,) int64 of each cluster, -1 for none.
+    """
     count, background = len(clusters), len(classes)
     number = np.repeat(np.arange(count), clusters.sizes)
     share, owners = np.zeros(count), np.full(count, -1)
@@ -62,8 +73,10 @@ def label_clusters(clusters: Clusters, boxes: np.ndarray, class_ids: np.ndarray,
 
 def label_points(xyz: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray,
                  classes: Sequence[str]) -> np.ndarray:
-    """(N,) int64 of points (N, 3): the class whose box they are in, else their number for
-    background; UNKNOWN for those in a box that is neither."""
+    """Label points (N, 3) by the class of their box, as (N,) int64.
+
+    len(classes) is background, UNKNOWN a box of an ignored class.
+    """
     labels = np.full(len(xyz), len(classes))
     for label, box in zip(map_labels(class_ids, classes), boxes):
         labels[points_in_box(xyz, box, BOX_MARGIN)] = label
@@ -71,15 +84,17 @@ def label_points(xyz: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray,
 
 
 def find_unlabelled(truth: GroundTruth, camera: Camera, xyz: np.ndarray) -> np.ndarray:
-    """(N,) bool: points (N, 3) in regions of the image where nothing is labelled (DontCare)."""
+    """Return a mask (N,) of the points in regions without labels (DontCare) of the image."""
     regions = [extra["bbox"] for name, extra in truth.notes if name == "DontCare"]
     return camera.in_regions(xyz, np.array(regions, float))
 
 
 def mask_unlabelled(labels: np.ndarray, clusters: Clusters, unlabelled: np.ndarray,
                     background: int) -> np.ndarray:
-    """labels (K,) of clusters with UNKNOWN for background of which half of the points or more are
-    not cared for, uncared (P,) bool."""
+    """Set the labels (K,) of background clusters to UNKNOWN if half of their points are unlabelled.
+
+    unlabelled (P,) bool is a mask of the points of all clusters.
+    """
     number = np.repeat(np.arange(len(clusters)), clusters.sizes)
     share = np.bincount(number, unlabelled, minlength=len(clusters)) / np.maximum(
         clusters.sizes, 1
@@ -88,8 +103,10 @@ def mask_unlabelled(labels: np.ndarray, clusters: Clusters, unlabelled: np.ndarr
 
 
 def map_labels(class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
-    """(M,) int64 into classes of class_ids (M,) into CLASSES; their number for what is background,
-    UNKNOWN for what looks like a class and is none."""
+    """Map class_ids (M,) into CLASSES to labels (M,) int64 into classes.
+
+    len(classes) is background, UNKNOWN a class that looks like one of classes but is not.
+    """
     return np.array([classes.index(name) if name in classes else
                      UNKNOWN if name in IGNORED_CLASSES else len(classes)
                      for name in (CLASSES[i] for i in class_ids)], np.int64)
@@ -98,9 +115,19 @@ def map_labels(class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
 def count_confusions(clusters: Clusters, labels: np.ndarray, predictions: Predictions,
                      point_truth: np.ndarray, cluster_ids: np.ndarray,
                      classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Counts (K + 1, K + 1) by true and by predicted class, background last, of one frame's
-    clusters with labels and what the network says of them, and of all N points with their labels
-    and the numbers of their clusters, 0 for none."""
+    """Count the clusters and points of one frame by true and predicted class.
+
+    Args:
+        clusters: the clusters.
+        labels: their true labels.
+        predictions: of the network.
+        point_truth: (N,) true labels of all points.
+        cluster_ids: (N,) cluster of each point, 0 for none.
+        classes: names of the labels.
+
+    Returns:
+        Counts of clusters and of points, (K + 1, K + 1) each, with background last.
+    """
     shape = len(classes) + 1, len(classes) + 1
     of_clusters, of_points = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
     predicted = predictions.probabilities.argmax(axis=1)
@@ -116,11 +143,13 @@ def count_confusions(clusters: Clusters, labels: np.ndarray, predictions: Predic
 
 def measure_network(weights: Path, settings: Mapping[str, Any],
                     recording: Recording) -> Callable[[Frame], Any]:
-    """Run a cluster network on every frame with labelled boxes, on its points in the image. With
-    the first arguments a Start of scoring.run.
+    """Run a cluster network on the points in the image of every frame with labelled boxes.
 
-    settings: parameters of ground and clustering by their dotted names, where they are not those
-    that the network was trained with.
+    partial(measure_network, weights, settings) is a Start of scoring.run.
+
+    Args:
+        settings: ground and clustering parameters by dotted name that differ from those of
+            training.
     """
     classifier = load_pointnet_detector(weights, "cpu", PointNetDetectorParams(
         pointnet=PointNetParams(warm_up=False))).classifier
@@ -154,8 +183,10 @@ def measure_network(weights: Path, settings: Mapping[str, Any],
 
 @dataclass
 class ClusterScores:
-    """Counts (K + 1, K + 1) by true and by found class, background last, of clusters and of all
-    points."""
+    """Confusion of clusters and of points, (K + 1, K + 1) each, by true and predicted class.
+
+    The last row and column is background.
+    """
 
     classes: tuple[str, ...]
     frames: int = 0
@@ -168,20 +199,20 @@ class ClusterScores:
         self.clusters, self.points = (np.zeros((count, count), np.int64) for _ in range(2))
 
     def update(self, counts: tuple[np.ndarray, np.ndarray]) -> None:
-        """One frame: counts of its clusters and of its points, as confusions() gives them."""
+        """Add the counts of one frame, as returned by count_confusions."""
         self.clusters += counts[0]
         self.points += counts[1]
         self.frames += 1
 
     def compute(self) -> dict[str, Any]:
-        """As JSON; shares in percent, None without objects."""
+        """Return the scores as JSON; shares in percent, None without objects."""
         return {"frames": self.frames, "classes": [*self.classes, "background"],
                 "min_points": MIN_POINTS, "clusters": _compute_scores(self.clusters, self.classes),
                 "points": _compute_scores(self.points, self.classes), "skipped": self.skipped}
 
 
 def _compute_scores(confusion: np.ndarray, classes: Sequence[str]) -> dict[str, Any]:
-    """accuracy; by class, and as the mean of the classes that occur, precision, recall, F1, IoU."""
+    """Compute accuracy, and precision, recall, F1 and IoU by class and as their mean."""
     right = np.diag(confusion)
     true, said = confusion.sum(axis=1), confusion.sum(axis=0)
     rows = {}

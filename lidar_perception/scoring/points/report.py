@@ -1,4 +1,4 @@
-"""Ground and clusters of every method against labelled points or boxes, frame by frame."""
+"""Ground segmentation and clustering against labelled points or boxes, frame by frame."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from lidar_perception.wire.params import ViewParams
 
 @dataclass(frozen=True)
 class SegmentationParams:
-    """The groups that matter here. The camera's view is on: KITTI has labels there only."""
+    """Parameters; the camera's view is on because KITTI labels nothing outside it."""
 
     view: ViewParams = ViewParams(enabled=True)
     ground: GroundParams = GroundParams()
@@ -39,8 +39,13 @@ class SegmentationParams:
 
 @dataclass(frozen=True)
 class SegmentationResult:
-    """One frame: by ground method what GroundReport.update takes, by clustering method what
-    ClusterReport.update takes; whole: there was no camera to crop to."""
+    """Results of one frame.
+
+    Attributes:
+        ground: arguments of GroundReport.update by ground method.
+        clusters: arguments of ClusterReport.update by clustering method.
+        whole: True if there was no camera to crop to.
+    """
 
     ground: dict[str, tuple] = field(default_factory=dict)
     clusters: dict[str, tuple] = field(default_factory=dict)
@@ -53,16 +58,19 @@ def measure_methods(
     clusterings: tuple[str, ...],
     recording: Recording,
 ) -> Callable[[Frame], SegmentationResult | None]:
-    """Runs the methods on every frame with labels. Ground is scored on labelled points, clusters on
-    their instances, or on labelled boxes: then on the ground of params, in the camera's view where
-    there is a camera. All but the recording given, a Start of scoring.run."""
-    timed = Timer()
+    """Run ground and clustering methods on every labelled frame.
 
-    def on_points(frame: Frame, labels: Any) -> SegmentationResult:
+    Ground is scored on labelled points. Clusters are scored on labelled instances or boxes; with
+    boxes on the ground of params, in the camera's view if there is a camera.
+    partial(measure_methods, params, grounds, clusterings) is a Start of scoring.run.
+    """
+    timer = Timer()
+
+    def measure_points(frame: Frame, labels: Any) -> SegmentationResult:
         scan, found, ground = frame.load(), {}, {}
         z = scan.xyz[:, 2] + np.float32(frame.sensor_height - SENSOR_HEIGHT)
         for name in grounds:
-            found[name], ms = timed(segment_ground, scan, replace(params.ground, method=name))
+            found[name], ms = timer(segment_ground, scan, replace(params.ground, method=name))
             ground[name] = count_by_protocol(found[name], labels.classes, z), ms
         if not clusterings:
             return SegmentationResult(ground)
@@ -70,20 +78,20 @@ def measure_methods(
         if chosen is None:
             chosen = segment_ground(scan, params.ground)
         objects = find_instances(scan.xyz, labels.classes, labels.instances)
-        return SegmentationResult(ground, clustered(scan, chosen, objects))
+        return SegmentationResult(ground, score_methods(scan, chosen, objects))
 
-    def on_boxes(frame: Frame, truth: Any) -> SegmentationResult:
+    def measure_boxes(frame: Frame, truth: Any) -> SegmentationResult:
         scan, camera = frame.load(), frame.camera()
         if camera is not None:
             _, scan = crop_to_view(scan, camera, params.view)
-        return SegmentationResult({}, clustered(scan, segment_ground(scan, params.ground),
+        return SegmentationResult({}, score_methods(scan, segment_ground(scan, params.ground),
                                                 find_objects_in_boxes(scan.xyz, truth)),
                                   whole=camera is None and params.view.enabled)
 
-    def clustered(scan: PointCloud, ground: np.ndarray, objects: Objects) -> dict:
+    def score_methods(scan: PointCloud, ground: np.ndarray, objects: Objects) -> dict:
         scores = {}
         for name in clusterings:
-            ids, ms = timed(cluster_obstacles, scan.xyz, ground,
+            ids, ms = timer(cluster_obstacles, scan.xyz, ground,
                             replace(params.clustering, method=name))
             scores[name] = objects.classes, objects.ranges, score_clusters(ids, objects), ms
         return scores
@@ -91,15 +99,17 @@ def measure_methods(
     def measure(frame: Frame) -> SegmentationResult | None:
         labels = frame.point_truth()
         if labels is not None:
-            return on_points(frame, labels)
+            return measure_points(frame, labels)
         truth = frame.truth()
-        return None if truth is None or not clusterings else on_boxes(frame, truth)
+        return None if truth is None or not clusterings else measure_boxes(frame, truth)
     return measure
 
 
 class Timer:
-    """timed(function, *arguments): the result and the milliseconds; the first time of a method
-    after a run that loads compiled code."""
+    """Stopwatch: timer(function, *arguments) -> (result, milliseconds).
+
+    The first call of a method is preceded by a run that loads compiled code.
+    """
 
     def __init__(self) -> None:
         self.warm: set[tuple[Any, str]] = set()
@@ -116,8 +126,10 @@ class Timer:
 
 @dataclass
 class SegmentationReport:
-    """Ground by method, clusters by source and method, frames left out. source: the layout of the
-    recording that comes next; whole: frames that had no camera to crop to."""
+    """Scores of ground by method, and of clusters by source and method.
+
+    source is the format of the next recording; whole counts frames without a camera to crop to.
+    """
 
     source: str = ""
     ground: dict[str, GroundReport] = field(default_factory=dict)
@@ -126,7 +138,7 @@ class SegmentationReport:
     whole: int = 0
 
     def update(self, result: SegmentationResult) -> None:
-        """One frame."""
+        """Add one frame."""
         for name, counts in result.ground.items():
             self.ground.setdefault(name, GroundReport()).update(*counts)
         for name, scores in result.clusters.items():
@@ -135,7 +147,7 @@ class SegmentationReport:
         self.whole += result.whole
 
     def compute(self) -> dict[str, Any]:
-        """What the JSON file holds."""
+        """Return the content of the JSON file."""
         return {"ground": {name: report.compute() for name, report in self.ground.items()},
                 "clusters": {source: {name: report.compute() for name, report in reports.items()}
                              for source, reports in self.clusters.items()},
@@ -144,7 +156,7 @@ class SegmentationReport:
 
 def segment_by_methods(frame: Frame, params: SegmentationParams, grounds: tuple[str, ...]
                        ) -> tuple[PointCloud, PointTruth | None, dict[str, np.ndarray]]:
-    """A frame, its labels, and the ground (N,) bool by each method, for a picture."""
+    """Return a frame, its labels, and the ground (N,) bool by each method, for a picture."""
     scan = frame.load()
     return scan, frame.point_truth(), {
         name: segment_ground(scan, replace(params.ground, method=name)) for name in grounds}

@@ -1,18 +1,16 @@
-"""Ground and clusters against labels: of every point (SemanticKITTI), or boxes (KITTI, bags).
+"""Ground and clusters against labels of points (SemanticKITTI) or boxes (KITTI, bags).
 
-Ground is counted under three protocols, since vegetation moves F1 by points. Ground are road,
-parking, sidewalk, other-ground, lane-marking and terrain; unlabelled points and outliers are left
-out. Vegetation is
+Ground is road, parking, sidewalk, other-ground, lane-marking and terrain; unlabelled points and
+outliers are ignored. There are three protocols, since vegetation changes F1 by several points:
 
-    without vegetation     left out too (Patchwork++, Lee et al., IROS 2022, Section IV-A);
-    with vegetation        ground where lower than z = -1.3 m in the LiDAR frame, which is 0.43 m
-                           above the road, wherever the sensor is, else not ground (Patchwork, Lim
-                           et al., RA-L 2021);
-    vegetation not ground  not ground, the class as it is.
+    without vegetation     vegetation is ignored (Patchwork++, Lee et al., IROS 2022, Section IV-A);
+    with vegetation        vegetation is ground below z = -1.3 m in the LiDAR frame of KITTI, 0.43 m
+    above the road, else not ground (Patchwork, Lim et al., RA-L 2021);
+    vegetation not ground  vegetation is not ground.
 
-A cluster and an object are compared by the points they share: IoU = |C and O| / |C or O|, and a
-hit is an IoU above one half, so that no cluster is the hit of two objects. Points of an object
-that the ground method took away count as missed.
+A cluster and an object are compared by their points: IoU = |C and O| / |C or O|. A hit is an IoU
+above one half, so a cluster hits at most one object. Points of an object that were segmented as
+ground count as missed.
 """
 
 from __future__ import annotations
@@ -30,18 +28,23 @@ PROTOCOLS = ("without vegetation", "with vegetation", "vegetation not ground")
 LOW_VEGETATION_Z = -1.3  # metres in the LiDAR frame of KITTI, 1.73 m above the road
 
 HIT_IOU = 0.5
-MIN_POINTS = 10      # objects with fewer points are not looked for
-BOTTOM_MARGIN = 0.2  # metres above the bottom of a box up to which its points may be the road's
-BOX_MARGIN = 0.2         # a cluster is judged if most of it is in labelled boxes grown by this
-MIN_PIECE_SHARE = 0.1          # a cluster with this share of an object's points is a piece of it
+MIN_POINTS = 10      # objects with fewer points are ignored
+BOTTOM_MARGIN = 0.2  # metres; points below this above the bottom of a box may be road
+BOX_MARGIN = 0.2         # metres; a cluster is scored if most of it is in boxes enlarged by this
+MIN_PIECE_SHARE = 0.1          # of an object's points in a cluster that is a piece of it
 RANGE_NAMES = ("0-15", "15-30", "30-45", "45+")
 RANGE_LIMITS = np.array([15.0, 30.0, 45.0])
 
 
 def select_true_ground(semantic: np.ndarray, z: np.ndarray,
                        protocol: str) -> tuple[np.ndarray, np.ndarray]:
-    """ground (N,) bool and counted (N,) bool of points with classes semantic (N,) and heights
-    z (N,) metres, as from KITTI's sensor. What is not counted is neither ground nor not ground."""
+    """Return the masks ground (N,) and counted (N,) of points.
+
+    Args:
+        semantic: (N,) classes.
+        z: (N,) height as seen from KITTI's sensor, metres.
+        protocol: one of PROTOCOLS.
+    """
     ground, counted = np.isin(semantic, GROUND), ~np.isin(semantic, UNLABELLED)
     vegetation = semantic == VEGETATION
     if protocol == "without vegetation":
@@ -52,20 +55,19 @@ def select_true_ground(semantic: np.ndarray, z: np.ndarray,
 
 
 def count_ground(found: np.ndarray, ground: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """(4,) int64 [tp fp fn tn] of found (N,) bool."""
+    """Count the prediction found (N,) bool as (4,) int64 [tp fp fn tn]."""
     case = np.where(ground, np.where(found, 0, 2), np.where(found, 1, 3))
     return np.bincount(case.compress(counted), minlength=4)
 
 
 def count_by_protocol(found: np.ndarray, semantic: np.ndarray,
                       z: np.ndarray) -> dict[str, np.ndarray]:
-    """ground_counts of each protocol: found (N,) bool, classes (N,), heights (N,) metres, as from
-    KITTI's sensor."""
+    """Count the prediction found (N,) bool under each protocol; see select_true_ground."""
     return {name: count_ground(found, *select_true_ground(semantic, z, name)) for name in PROTOCOLS}
 
 
 def to_ground_row(counts: np.ndarray) -> dict:
-    """Counts (4,) and their ratios for the JSON file. A ratio without cases is 0."""
+    """Return counts (4,) and their ratios for the JSON file. A ratio without cases is 0."""
     tp, fp, fn, tn = counts.tolist()
     return dict(tp=tp, fp=fp, fn=fn, tn=tn, precision=_divide(tp, tp + fp),
                 recall=_divide(tp, tp + fn), f1=_divide(2 * tp, 2 * tp + fp + fn),
@@ -74,20 +76,20 @@ def to_ground_row(counts: np.ndarray) -> dict:
 
 @dataclass
 class GroundReport:
-    """Counts of one ground method by protocol, all points of all scans together."""
+    """Counts of one ground method by protocol, over the points of all scans."""
 
     counts: dict[str, np.ndarray] = field(
         default_factory=lambda: {name: np.zeros(4, np.int64) for name in PROTOCOLS})
     ms: list[float] = field(default_factory=list)
 
     def update(self, counts: dict[str, np.ndarray], ms: float) -> None:
-        """One scan: counts of ground_by_protocol, time of the method."""
+        """Add one scan: counts of count_by_protocol and the duration of the method."""
         for name, total in self.counts.items():
             total += counts[name]
         self.ms.append(ms)
 
     def compute(self) -> dict:
-        """What the JSON file holds."""
+        """Return the content of the JSON file."""
         return {"scans": len(self.ms), "ms": _compute_median(self.ms),
                 "protocols": {name: to_ground_row(c) for name, c in self.counts.items()}}
 
@@ -96,10 +98,13 @@ class GroundReport:
 class Objects:
     """K labelled objects among N points.
 
-    owner (N,) int32: the object 1..K whose point it is, or 0. region (N,) int32: owner, and also
-    the points that speak neither for nor against a cluster of that object. near (N,) bool: points
-    where a cluster is judged. counted (N,) bool: the others are left out altogether, as nobody
-    knows what they are. classes K names; ranges (K,) metres, horizontally.
+    Attributes:
+        owner: (N,) int32 object 1..K of each point, or 0.
+        region: (N,) int32 owner, and also points that are neutral for clusters of that object.
+        near: (N,) bool points whose clusters are scored.
+        counted: (N,) bool points with a known class; the others are ignored.
+        classes: K names.
+        ranges: (K,) horizontal range, metres.
     """
 
     owner: np.ndarray
@@ -111,11 +116,10 @@ class Objects:
 
 
 def find_objects_in_boxes(xyz: np.ndarray, truth: GroundTruth) -> Objects:
-    """Objects of labelled boxes, without DontCare, with at least MIN_POINTS points.
+    """Return the objects of labelled boxes, except DontCare, with at least MIN_POINTS points.
 
-    A box stands on the road and holds some of it, so an object's points are those more than
-    BOTTOM above its bottom face; those below are neutral. A point in two boxes belongs to the
-    smaller one.
+    A box contains some of the road, so an object's points are more than BOTTOM_MARGIN above the
+    bottom of the box; lower ones are neutral. A point in two boxes belongs to the smaller one.
     """
     owner, region = np.zeros((2, len(xyz)), np.int32)
     for k in np.argsort(-np.prod(truth.boxes[:, 3:6], axis=1), kind="stable"):
@@ -134,9 +138,11 @@ def find_objects_in_boxes(xyz: np.ndarray, truth: GroundTruth) -> Objects:
 
 
 def find_instances(xyz: np.ndarray, semantic: np.ndarray, instance: np.ndarray) -> Objects:
-    """Objects of SemanticKITTI with at least MIN_POINTS points: things of one class and instance,
-    moving or not. Left out: unlabelled points, outliers, things without an instance, and objects
-    of fewer points."""
+    """Return the objects of SemanticKITTI with at least MIN_POINTS points.
+
+    An object is the points of one class and instance, moving or not. Unlabelled points, outliers,
+    things without an instance and smaller objects are ignored.
+    """
     table = np.zeros(1 << 16, np.int32)
     table[list(THINGS)] = list(THINGS)
     table[list(MOVING)] = list(MOVING.values())
@@ -158,9 +164,12 @@ def find_instances(xyz: np.ndarray, semantic: np.ndarray, instance: np.ndarray) 
 class ClusterScore:
     """Clusters of one frame against K objects.
 
-    iou (K,) with the best cluster, 0 without one; pieces (K,) int: clusters with at least PIECE of
-    the object's points; shared (K,) bool: the best cluster is a piece of another object too.
-    clusters: how many there are; judged: those with most of their points near objects.
+    Attributes:
+        iou: (K,) IoU with the best cluster, 0 without one.
+        pieces: (K,) number of clusters with at least MIN_PIECE_SHARE of the object's points.
+        shared: (K,) bool, True if the best cluster is also a piece of another object.
+        clusters: number of clusters.
+        judged: number of clusters with most of their points near objects.
     """
 
     iou: np.ndarray
@@ -171,8 +180,11 @@ class ClusterScore:
 
 
 def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
-    """cluster_ids (N,) int, 0 = none; which number a cluster has does not matter, nor does memory
-    follow it: of objects and clusters only the pairs that share points are looked at."""
+    """Score the clusters cluster_ids (N,) int, 0 = none, of a frame.
+
+    The result does not depend on the numbers of the clusters. Memory grows with the pairs of
+    objects and clusters that share points only.
+    """
     labels, numbers = renumber_ids(cluster_ids)
     ids, owner, region, near = (a.compress(objects.counted).astype(np.int64) for a in (
         labels, objects.owner, objects.region, objects.near))
@@ -182,7 +194,7 @@ def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
     pairs, common = np.unique(owner[both] * len(size) + ids[both], return_counts=True)
     touched, inside = np.unique(region * len(size) + ids, return_counts=True)
     thing, cluster = np.divmod(pairs, len(size))
-    # A point of an object is in its region, so each pair is among those of the regions.
+    # the points of an object are in its region, so each pair is also a pair of the regions
     iou = common / (size[cluster] + points[thing] - inside[np.searchsorted(touched, pairs)])
     piece = common >= MIN_PIECE_SHARE * points[thing]
     best = np.zeros(rows)
@@ -203,12 +215,12 @@ class ClusterReport:
 
     def update(self, classes: tuple[str, ...], ranges: np.ndarray, score: ClusterScore,
                ms: float) -> None:
-        """One frame: classes and ranges (K,) of its Objects, score_clusters(), time."""
+        """Add one frame: classes and ranges (K,) of its Objects, its score, and the duration."""
         self.frames.append((classes, ranges, score))
         self.ms.append(ms)
 
     def compute(self) -> dict:
-        """What the JSON file holds. precision: share of the judged clusters that are hits."""
+        """Return the content of the JSON file. precision is hits / judged clusters."""
         classes = np.array([c for names, _, _ in self.frames for c in names], str)
         ranges = _concatenate(each for _, each, _ in self.frames)
         bins = np.searchsorted(RANGE_LIMITS, ranges, "right")
@@ -229,7 +241,7 @@ class ClusterReport:
 
 
 def _to_object_row(iou: np.ndarray, pieces: np.ndarray, shared: np.ndarray) -> dict:
-    """mean_pieces is over the objects that have a piece; 1 is none cut, None without any."""
+    """mean_pieces is the mean over objects with a piece; 1 is no over-segmentation."""
     count, hits = len(iou), int(np.sum(iou > HIT_IOU))
     over, under = int(np.sum(pieces > 1)), int(np.sum(shared))
     return dict(objects=count, hits=hits, recall=_divide(hits, count),
@@ -240,7 +252,7 @@ def _to_object_row(iou: np.ndarray, pieces: np.ndarray, shared: np.ndarray) -> d
 
 
 def _renumber(ids: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """(N,) int32: 1.. in the order of chosen where ids (N,) is among them, else 0."""
+    """Map ids (N,) to their position 1.. in chosen, else 0, as (N,) int32."""
     table = np.zeros(max(ids.max(initial=0), chosen.max(initial=0)) + 1, np.int32)
     table[chosen] = np.arange(1, len(chosen) + 1)
     return table[ids]

@@ -17,15 +17,15 @@ from lidar_perception.scoring.points.segmentation import (
 from lidar_perception.scoring.tables import format_counts, format_percent, make_table, print_skipped
 from lidar_perception.types import PointCloud
 
-# Patchwork++ on sequences 00 to 10 of SemanticKITTI, mean of the sequences, in percent: precision,
-# recall, F1. The first from the paper (IROS 2022, Table I), the second from its repository.
+# Patchwork++ on sequences 00 to 10 of SemanticKITTI, mean over sequences, percent: precision,
+# recall, F1. The first row is from the paper (IROS 2022, Table I), the second from its repository.
 PUBLISHED = {"without vegetation": (94.92, 98.18, 96.51), "with vegetation": (93.72, 92.33, 92.87)}
 
-MAX_DRAWN_RANGE = 50.0  # metres to each side that are drawn
+MAX_DRAWN_RANGE = 50.0  # metres to each side
 
 
 def print_scores(content: dict, ground_method: str, console: Console) -> None:
-    """Tables of ground, and of clusters for each source."""
+    """Print tables of ground, and of clusters for each source."""
     if content["ground"]:
         _print_ground(content["ground"], console)
     for source, reports in content["clusters"].items():
@@ -76,7 +76,7 @@ def _print_clusters(reports: dict, title: str, console: Console) -> None:
 
 
 def _format_object(row: dict) -> list[str]:
-    """Precision and F1 are known for all objects together only."""
+    """Precision and F1 exist only for all objects together."""
     judged = format_percent(row, "precision", "f1") if "precision" in row else ("", "")
     return [*format_counts(row, "objects", "hits"), *format_percent(row, "recall"), *judged,
             *format_percent(row, "mean_iou", "over_segmentation", "under_segmentation")]
@@ -92,8 +92,10 @@ def _format_count(count: int, noun: str) -> str:
 
 def draw_ground(path: Path, name: str, frame: PointCloud, semantic: np.ndarray,
                 found: dict[str, np.ndarray]) -> None:
-    """Write a PNG: the scan from above, for each method what it found (N,) of the true ground.
-    x (forward) points up, y (left) to the left, metres. Vegetation is left out of the count."""
+    """Draw the ground (N,) of each method in a BEV picture, and write it as PNG.
+
+    x (forward) points up, y (left) to the left, metres. Vegetation is not counted.
+    """
     import matplotlib
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt

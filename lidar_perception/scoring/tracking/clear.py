@@ -1,4 +1,4 @@
-"""CLEAR MOT (Bernardin and Stiefelhagen, 2008) as TrackEval counts it."""
+"""CLEAR MOT (Bernardin and Stiefelhagen, 2008) as counted by TrackEval."""
 
 from __future__ import annotations
 
@@ -9,16 +9,22 @@ import numpy as np
 from lidar_perception.scoring.tracking.pairs import EPS, MIN_SIMILARITY, Pairs, find_best_pairs
 
 CONTINUATION_GAIN = (
-    1000.0  # gain of going on with the track of the frame before, above any similarity
+    1000.0  # for pairs of the previous frame; above any similarity
 )
 
 
 @dataclass(frozen=True)
 class ClearCounts:
-    """tp, fn, fp: boxes; switches: a label found under another id than the last time; fragments:
-    how often a label is found again after a gap; mostly_tracked, partly_tracked, mostly_lost:
-    labelled tracks found in more than 80 %, 20 % and more, less of their frames; located: sum of
-    similarities."""
+    """Counts of one or more sequences.
+
+    Attributes:
+        tp, fn, fp: boxes.
+        switches: labels matched to another id than the last time.
+        fragments: labels matched again after a gap.
+        mostly_tracked, partly_tracked, mostly_lost: labelled tracks matched in more than 80 %, in
+            20 % or more, in less than 20 % of their frames.
+        located: sum of similarities.
+    """
 
     tp: int = 0
     fn: int = 0
@@ -34,8 +40,7 @@ class ClearCounts:
         return ClearCounts(*(a + b for a, b in zip(astuple(self), astuple(other))))
 
     def scores(self) -> dict[str, float]:
-        """MOTA, up to 1 and below 0 where errors are many, MOTP, and precision and recall 0..1; 0
-        without a case."""
+        """Return MOTA (at most 1, may be negative), MOTP, recall and precision; 0 without cases."""
         objects = max(1, self.tp + self.fn)
         return {"MOTA": (self.tp - self.fp - self.switches) / objects,
                 "MOTP": self.located / max(1, self.tp),
@@ -43,8 +48,11 @@ class ClearCounts:
 
 
 def count_clear(frames: list[Pairs], alike: float = MIN_SIMILARITY) -> ClearCounts:
-    """The counts of one sequence, its frames in order, as without_ignored gives them. Boxes from a
-    similarity of `alike` on can match; a pair of the frame before goes on where it can."""
+    """Count one sequence; its frames in order, as returned by drop_ignored.
+
+    Boxes of a similarity of at least `alike` can match. A pair of the previous frame is kept if
+    possible.
+    """
     true_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.true_ids for f in frames)]))
     last, before = (np.full(len(true_ids), -1, np.int64) for _ in range(2))
     seen, found, runs = (np.zeros(len(true_ids), int) for _ in range(3))
@@ -55,7 +63,7 @@ def count_clear(frames: list[Pairs], alike: float = MIN_SIMILARITY) -> ClearCoun
         seen[i] += 1
         fp += len(f.track_ids)
         if len(i) == 0 or len(f.track_ids) == 0:
-            continue  # what was matched before can go on after such a frame, as in TrackEval
+            continue  # earlier matches can continue after such a frame, as in TrackEval
         gain = CONTINUATION_GAIN * (f.track_ids == before[i][:, None]) + f.similarity
         rows, columns = find_best_pairs(np.where(f.similarity < alike - EPS, 0.0, gain))
         who, ids = i[rows], f.track_ids[columns]

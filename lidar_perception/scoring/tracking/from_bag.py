@@ -1,4 +1,4 @@
-"""Tracks that were recorded to a bag, against the labels beside them."""
+"""Scores of tracks that were recorded to a bag with labels."""
 
 from __future__ import annotations
 
@@ -19,8 +19,13 @@ from lidar_perception.wire.messages import to_detections, to_truth
 
 @dataclass(frozen=True)
 class RecordedTracks:
-    """count: tracks by class; scores by class as TrackingReport has them, None for a class that is
-    neither labelled nor tracked; problem: why there are no scores, if so."""
+    """Scores of recorded tracks.
+
+    Attributes:
+        count: number of tracks by class.
+        scores: by class as in TrackingReport, None for a class without labels and tracks.
+        problem: why there are no scores, or None.
+    """
 
     count: dict[str, int]
     scores: dict[str, dict[str, Any] | None]
@@ -29,7 +34,7 @@ class RecordedTracks:
 
 def score_recorded_tracks(frames: Sequence[RecordedResult], calibration: Calibration | None
                           ) -> RecordedTracks:
-    """The tracks in answered frames."""
+    """Score the tracks in recorded results."""
     labels = [(label, i) for frame in frames
               for i, label in zip(frame.found.ids.tolist(), frame.found.labels)]
     count = {name: len({i for label, i in labels if label == name})

@@ -1,6 +1,6 @@
-"""HOTA (Luiten et al., IJCV 2021): detection and association of tracks, weighed evenly.
+"""HOTA (Luiten et al., IJCV 2021), the balance of detection and association of tracks.
 
-Counts of single sequences are added; what is derived from them comes last.
+Counts are added over sequences; scores are computed from the sums.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from lidar_perception.scoring.tracking.pairs import EPS, Pairs, find_best_pairs
 
-ALPHAS = np.arange(0.05, 0.99, 0.05)  # 19 similarities from which on two boxes are one
+ALPHAS = np.arange(0.05, 0.99, 0.05)  # 19 similarity thresholds
 
 
 def _zeros() -> np.ndarray:
@@ -20,8 +20,13 @@ def _zeros() -> np.ndarray:
 
 @dataclass(frozen=True)
 class HotaCounts:
-    """By ALPHAS (19,) float64: tp, fn, fp; associated: over true positives, the sum of the share of
-    their two tracks that runs together; located: the sum of their similarities."""
+    """Counts at each of ALPHAS, (19,) float64.
+
+    Attributes:
+        tp, fn, fp: counts of boxes.
+        associated: sum over true positives of the share of frames in which their tracks match.
+        located: sum over true positives of their similarity.
+    """
 
     tp: np.ndarray = field(default_factory=_zeros)
     fn: np.ndarray = field(default_factory=_zeros)
@@ -34,7 +39,10 @@ class HotaCounts:
                             for name in ("tp", "fn", "fp", "associated", "located")))
 
     def scores(self) -> dict[str, float]:
-        """HOTA, DetA, AssA, DetRe, DetPr and LocA, 0..1, means over ALPHAS; 0 without a case."""
+        """Return HOTA, DetA, AssA, DetRe, DetPr and LocA, 0..1, averaged over ALPHAS.
+
+        They are 0 without cases.
+        """
         det_a = self.tp / np.maximum(1.0, self.tp + self.fn + self.fp)
         ass_a = self.associated / np.maximum(1.0, self.tp)
         curves = {"HOTA": np.sqrt(det_a * ass_a), "DetA": det_a, "AssA": ass_a,
@@ -45,7 +53,7 @@ class HotaCounts:
 
 
 def count_hota(frames: list[Pairs]) -> HotaCounts:
-    """The counts of one sequence; its frames in order, as without_ignored gives them."""
+    """Count one sequence; its frames in order, as returned by drop_ignored."""
     true_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.true_ids for f in frames)]))
     track_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.track_ids for f in frames)]))
     indices = [(np.searchsorted(true_ids, f.true_ids), np.searchsorted(track_ids, f.track_ids))
@@ -62,7 +70,7 @@ def count_hota(frames: list[Pairs]) -> HotaCounts:
     matches = np.zeros((len(ALPHAS), len(true_ids), len(track_ids)))
     located = _zeros()
     for f, (i, j) in zip(frames, indices):
-        # Pairs that nothing speaks for may match too; they are below every alpha.
+        # pairs of similarity 0 can be assigned too; they are below every alpha
         rows, columns = find_best_pairs(alignment[np.ix_(i, j)] * f.similarity)
         alike = f.similarity[rows, columns]
         good = alike >= ALPHAS[:, None] - EPS

@@ -1,9 +1,9 @@
-"""AB3DMOT's sAMOTA, AMOTA and AMOTP (Weng et al., IROS 2020): CLEAR MOT in space, averaged over
-recall, by the counting of its own script (KITTI's, with 3D IoU).
+"""AB3DMOT's sAMOTA, AMOTA and AMOTP (Weng et al., IROS 2020): 3D CLEAR MOT averaged over recall.
 
-Tracks count by the mean of their scores; from the best down, 40 thresholds take them in. Beside
-CLEAR MOT the script counts hits on labels that need not be found as true positives, an id switch
-only between neighbouring frames, and does not prefer the pair of the frame before.
+Counting follows the paper's own script for KITTI with 3D IoU. Tracks are ranked by their mean
+score, and 40 thresholds select them. Unlike CLEAR MOT, the script counts hits on ignored labels as
+true positives, counts an id switch only between consecutive frames, and does not prefer the pair of
+the previous frame.
 """
 
 from __future__ import annotations
@@ -16,15 +16,17 @@ from scipy.optimize import linear_sum_assignment
 
 from lidar_perception.scoring.tracking.pairs import Pairs
 
-MIN_OVERLAP = 0.25  # of boxes that can match
+MIN_OVERLAP = 0.25  # IoU of a match
 STEPS = 40      # recall 1/40, 2/40, .. 1
-FORBIDDEN = 1e6  # cost of a pair that overlaps too little
+FORBIDDEN = 1e6  # cost of a pair below MIN_OVERLAP
 
 
 @dataclass(frozen=True)
 class RecallPoint:
-    """Counts with the tracks whose mean score is threshold or more. tp with, objects and fn without
-    the labels that need not be found; overlap: the sum over tp."""
+    """Counts over tracks with a mean score of at least threshold.
+
+    tp includes ignored labels; objects and fn do not. overlap is the sum over tp.
+    """
 
     threshold: float
     recall: float
@@ -37,12 +39,12 @@ class RecallPoint:
 
     @property
     def mota(self) -> float:
-        """1 and less; -inf without objects."""
+        """At most 1; -inf without objects."""
         return 1 - (self.fn + self.fp + self.switches) / self.objects if self.objects else -np.inf
 
     @property
     def smota(self) -> float:
-        """0..1: MOTA with 1 for all that can be had at this recall."""
+        """MOTA scaled to 0..1 by the best value possible at this recall."""
         if not self.objects:
             return 0.0
         wrong = self.fn + self.fp + self.switches - (1 - self.recall) * self.objects
@@ -50,8 +52,11 @@ class RecallPoint:
 
 
 def score_over_recall(sequences: list[list[Pairs]]) -> dict[str, float | None]:
-    """sAMOTA, AMOTA, AMOTP, and best_MOTA with its threshold best_score, of sequences of frames in
-    order (as pairs_of gives them); 0 without a track that matches, best_score then None."""
+    """Return sAMOTA, AMOTA, AMOTP, best_MOTA, and best_score, the threshold of best_MOTA.
+
+    sequences are lists of frames in order, as returned by make_pairs. Scores are 0 without a
+    matching track, best_score is then None.
+    """
     means = [_average_scores(frames) for frames in sequences]
     matched = [[np.zeros(len(f.track_ids), bool) for f in frames] for frames in sequences]
     hits: list[float] = []
@@ -76,7 +81,7 @@ def _average_scores(frames: list[Pairs]) -> dict[int, float]:
 
 
 def _choose_thresholds(scores: np.ndarray, objects: int) -> list[tuple[float, float]]:
-    """Score and recall: of the scores of all hits those nearest to recall 1/40, 2/40, .."""
+    """Return (score, recall) of the hits nearest to recall 1/40, 2/40, .."""
     ordered, chosen, wanted = np.sort(scores)[::-1], [], 0.0
     for i, score in enumerate(ordered.tolist()):
         recall = (i + 1) / objects
@@ -91,12 +96,15 @@ def _choose_thresholds(scores: np.ndarray, objects: int) -> list[tuple[float, fl
 def _count_at_threshold(sequences: list[list[Pairs]], means: list[dict[int, float]],
                         matched: list[list[np.ndarray]], threshold: float, recall: float,
                         hits: list[float]) -> RecallPoint:
-    """One pass. hits gets the score of every hit; matched is kept up: a track that once matched is
-    never excused again, as in the script."""
+    """Count at one threshold.
+
+    The score of each hit is appended to hits. matched is updated in place: a track that matched
+    once is never excused again, as in the script.
+    """
     tp = fn = fp = switches = objects = 0
     overlap = 0.0
     for frames, score, was in zip(sequences, means, matched):
-        stories: dict[int, list[tuple[int, bool]]] = {}
+        histories: dict[int, list[tuple[int, bool]]] = {}
         for f, matched_once in zip(frames, was):
             average = np.array([score[i] for i in f.track_ids.tolist()])
             kept = np.flatnonzero(average >= threshold) if len(average) else np.zeros(0, int)
@@ -115,8 +123,8 @@ def _count_at_threshold(sequences: list[list[Pairs]], means: list[dict[int, floa
             ids = np.full(len(f.true_ids), -1, np.int64)
             ids[rows] = f.track_ids[columns]
             for true_id, track, ignored in zip(f.true_ids.tolist(), ids.tolist(), f.ignored):
-                stories.setdefault(true_id, []).append((track, bool(ignored)))
-        switches += sum(map(_count_switches, stories.values()))
+                histories.setdefault(true_id, []).append((track, bool(ignored)))
+        switches += sum(map(_count_switches, histories.values()))
     return RecallPoint(threshold, recall, tp, fn, fp, switches, objects, overlap)
 
 
@@ -127,13 +135,12 @@ def _match(overlap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rows[good], columns[good]
 
 
-def _count_switches(story: list[tuple[int, bool]]) -> int:
-    """Of one label: in each of its frames the track it was found by, or -1, and whether it was
-    one that need not be found."""
-    count, last = 0, story[0][0]
-    if all(ignored for _, ignored in story):
+def _count_switches(history: list[tuple[int, bool]]) -> int:
+    """Count the switches of one label, given (track or -1, is ignored) for each of its frames."""
+    count, last = 0, history[0][0]
+    if all(ignored for _, ignored in history):
         return 0
-    for (before, _), (track, ignored) in itertools.pairwise(story):
+    for (before, _), (track, ignored) in itertools.pairwise(history):
         if ignored:
             last = -1
             continue

@@ -1,8 +1,8 @@
-"""One frame for the tracking scores: which labels and tracks there are, and how alike they are.
+"""Labels and tracks of one frame for the tracking scores, and their similarity.
 
-What counts follows KITTI's tracking benchmark as TrackEval runs it: neighbour classes, labels that
-are cut off by the image's border or hardly visible, DontCare regions and small boxes neither help
-nor harm; nor do labels outside the image, of which KITTI has none.
+What counts follows KITTI's tracking benchmark as run by TrackEval: labels of neighbour classes,
+truncated or hardly visible labels, DontCare regions and small boxes are ignored. Labels outside the
+image, which KITTI does not have, are ignored too.
 """
 
 from __future__ import annotations
@@ -21,22 +21,25 @@ from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 
 MAX_OCCLUSION, MAX_TRUNCATION = 2, 0  # levels of the tracking layout
 MIN_HEIGHT = 25.0    # pixels
-MAX_REGION_SHARE = 0.5      # share of a box in a DontCare region
-MAX_CENTRE_DISTANCE = 2.0  # metres between centres from which on two boxes are not alike at all
-MIN_SIMILARITY = 0.5          # for CLEAR MOT, and for what is left out
-EPS = np.finfo(float).eps  # as TrackEval compares
+MAX_REGION_SHARE = 0.5      # of a box inside a DontCare region
+MAX_CENTRE_DISTANCE = 2.0  # metres, where the similarity of centres is 0
+MIN_SIMILARITY = 0.5          # of a match in CLEAR MOT, and with an ignored label
+EPS = np.finfo(float).eps  # tolerance of comparisons in TrackEval
 
 SIMILARITIES = ("centres", "3d", "image")
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """M labels of one class and its neighbours, and K tracks of the class, in one frame.
+    """M labels of a class and its neighbours, and K tracks of the class, in one frame.
 
-    true_ids (M,), track_ids (K,) int64, each at most once; scores (K,) float64. ignored (M,) bool:
-    labels that nobody needs to find. excused (K,) bool: tracks that are not false where they match
-    nothing. similarity (M, K) float64 0..1 is what HOTA and CLEAR MOT match by, overlap (M, K)
-    float64 the IoU in space, for AB3DMOT's scores.
+    Attributes:
+        true_ids, track_ids: (M,) and (K,) int64, unique.
+        ignored: (M,) bool labels that need not be detected.
+        scores: (K,) float64.
+        excused: (K,) bool tracks that are not false positives if they match nothing.
+        similarity: (M, K) float64 0..1, for HOTA and CLEAR MOT.
+        overlap: (M, K) float64 3D IoU, for AB3DMOT's scores.
     """
 
     true_ids: np.ndarray
@@ -49,18 +52,23 @@ class Pairs:
 
 
 def to_tracked_labels(ids: np.ndarray, detections: Detections) -> GroundTruth:
-    """Tracks with ids (K,) as labels with track_id and score."""
+    """Convert tracks with ids (K,) to labels with track_id and score."""
     return GroundTruth.of(detections.boxes, detections.class_ids, [
         {"track_id": int(i), "score": float(s)} for i, s in zip(ids, detections.scores)])
 
 
 def make_pairs(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration | None,
                similarity: str = "centres") -> dict[str, Pairs]:
-    """One frame by class that is detected. truth and tracks with a track_id in every extra, tracks
-    with a score too. Without a calibration nothing is too small, and there are no DontCare regions.
+    """Make the pairs of one frame by detected class.
 
-    similarity: "centres" 1 - distance / 2 m, "3d" IoU in space, "image" IoU of the 2D boxes.
-    InputError for a track id that is there twice, or none, and a number that is not finite.
+    Args:
+        truth: labels with a track_id in each extra.
+        tracks: labels with a track_id and score in each extra.
+        calibration: None if no box is too small and there are no DontCare regions.
+        similarity: "centres" 1 - distance / 2 m, "3d" 3D IoU, "image" IoU of the 2D boxes.
+
+    Raises:
+        InputError: a track id is missing or duplicate, or a number is not finite.
     """
     if similarity not in SIMILARITIES:
         raise InputError(f"similarity = {similarity!r} must be one of {', '.join(SIMILARITIES)}")
@@ -68,7 +76,7 @@ def make_pairs(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration
         raise InputError("similarity in the image needs a calibration; take 'centres' or '3d'")
     true_ids, track_ids = read_track_ids(truth, "label"), read_track_ids(tracks, "track")
     true, found = (to_camera_objects(objects, calibration) for objects in (truth, tracks))
-    # Regions without a box come last there, and are in .regions.
+    # regions without a box come last and are in .regions
     true_objects, objects = true.take(np.arange(len(truth))), found.take(np.arange(len(tracks)))
     ignored = np.array([extra.get("occluded", 0) > MAX_OCCLUSION or round(
         extra.get("truncated", 0)) > MAX_TRUNCATION for extra in truth.extras], bool)
@@ -84,7 +92,10 @@ def make_pairs(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration
 
 
 def read_track_ids(objects: GroundTruth, what: str) -> np.ndarray:
-    """(N,) int64 track ids. InputError where one is missing (KITTI writes -1), or there twice."""
+    """Read the track ids (N,) int64.
+
+    Raises InputError if one is missing (-1 in KITTI) or duplicate; `what` names the objects.
+    """
     ids = np.array([extra.get("track_id", -1) for extra in objects.extras], np.int64)
     if (ids < 0).any():
         raise InputError(f"a {what} has no track id; tracking scores need one in each")
@@ -113,8 +124,11 @@ def _make_class_pairs(name: str, true: CameraObjects, found: CameraObjects, true
 
 
 def compute_image_iou(boxes: np.ndarray, others: np.ndarray, of_first: bool = False) -> np.ndarray:
-    """(K, M) IoU of 2D boxes (K, 4) and (M, 4) [left top right bottom]; of_first: the share of
-    each of boxes that lies in others. 0 for a box without area."""
+    """Compute the IoU (K, M) of 2D boxes (K, 4) and (M, 4) [left top right bottom].
+
+    With of_first, compute the share of each of boxes that is inside others. 0 for a box without
+    area.
+    """
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
     shared = np.prod(np.maximum(high - low, 0.0), axis=2)
@@ -128,8 +142,10 @@ def _find_in_regions(boxes: np.ndarray, regions: np.ndarray) -> np.ndarray:
 
 
 def drop_ignored(pairs: Pairs) -> Pairs:
-    """What HOTA and CLEAR MOT count: without the labels that need not be found, the tracks matched
-    to them, and excused tracks that match nothing."""
+    """Return the pairs that HOTA and CLEAR MOT count.
+
+    Ignored labels, tracks matched to them, and excused tracks that match nothing are dropped.
+    """
     rows, columns = find_best_pairs(
         np.where(pairs.similarity < MIN_SIMILARITY - EPS, 0.0, pairs.similarity)
     )
@@ -144,7 +160,10 @@ def drop_ignored(pairs: Pairs) -> Pairs:
 
 
 def find_best_pairs(gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (P,) and columns (P,) of the greatest sum of gain (M, K), only those above 0."""
+    """Return the rows (P,) and columns (P,) of the assignment of maximum total gain (M, K).
+
+    Pairs without gain are dropped.
+    """
     rows, columns = linear_sum_assignment(gain, maximize=True)
     good = gain[rows, columns] > EPS
     return rows[good], columns[good]

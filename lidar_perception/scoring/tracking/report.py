@@ -1,4 +1,4 @@
-"""Tracking scores by class: frames go in one by one, in any order, and the table comes out."""
+"""Tracking scores by class; frames may be added in any order."""
 
 from __future__ import annotations
 
@@ -28,18 +28,23 @@ from lidar_perception.types import GroundTruth, InputError
 
 @dataclass(frozen=True)
 class Observation:
-    """One frame, number index of its sequence, by class; small, and can go between processes.
-    posed: whether the source of poses had one for it."""
+    """Labels and tracks of frame `index` of a sequence, by class.
+
+    has_pose is False if the source of poses had none for the frame.
+    """
 
     sequence: str
     index: int
     pairs: dict[str, Pairs]
-    posed: bool = True
+    has_pose: bool = True
 
 
 def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
             calibration: Calibration | None = None, similarity: str = "centres") -> Observation:
-    """As pairs_of. InputError, with sequence and frame, where it cannot be scored."""
+    """Make the Observation of a frame; see make_pairs.
+
+    Raises InputError that names the sequence and frame if it cannot be scored.
+    """
     try:
         return Observation(sequence, index, make_pairs(truth, tracks, calibration, similarity))
     except InputError as error:
@@ -48,8 +53,10 @@ def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
 
 def measure_tracking(open_: Callable[[], Detector], params: TrackingParams = TrackingParams(),
                      ego: str = "auto") -> Start:
-    """Track what the detector of open_() finds, see DriveTracker. Frames must be measured in order
-    of time, in one process."""
+    """Make a Start that tracks the detections of open_(), see DriveTracker.
+
+    Frames must be measured in order of time, in one process.
+    """
     return partial(_measure_tracking, open_, params, ego)
 
 
@@ -74,34 +81,36 @@ def _measure_tracking(open_: Callable[[], Detector], params: TrackingParams, ego
                 to_tracked_labels(tracks.ids, tracks.detections),
                 frame.calibration(),
             ),
-            posed=tracker.has_pose,
+            has_pose=tracker.has_pose,
         )
     return measure
 
 
 @dataclass
 class TrackingReport:
-    """Frames of sequences. A frame that comes twice counts once, the last time."""
+    """Frames of sequences. A frame that is added twice counts once, the last time."""
 
     frames: dict[tuple[str, int], dict[str, Pairs]] = field(default_factory=dict)
-    unposed: set[tuple[str, int]] = field(default_factory=set)
+    without_pose: set[tuple[str, int]] = field(default_factory=set)
     skipped: list[str] = field(default_factory=list)
 
     def update(self, observation: Observation) -> None:
-        """One frame more."""
+        """Add one frame."""
         key = observation.sequence, observation.index
         self.frames[key] = observation.pairs
-        (self.unposed.discard if observation.posed else self.unposed.add)(key)
+        (self.without_pose.discard if observation.has_pose else self.without_pose.add)(key)
 
     def compute(self) -> dict:
-        """What the JSON file holds: frames, those of them without a pose, sequences, and by class
-        the scores, 0..1, and their counts; None for a class that has neither label nor track."""
+        """Return the content of the JSON file: counts of frames, and scores by class.
+
+        Scores are 0..1. A class without labels and tracks is None.
+        """
         names = sorted({sequence for sequence, _ in self.frames})
         ordered = {name: [self.frames[key] for key in sorted(self.frames) if key[0] == name]
                    for name in names}
         return {
             "frames": len(self.frames),
-            "without_pose": len(self.unposed),
+            "without_pose": len(self.without_pose),
             "sequences": len(names),
             "skipped": self.skipped,
             "classes": {

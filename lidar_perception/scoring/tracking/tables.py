@@ -14,7 +14,7 @@ COUNTS = {"labels": "labels", "IDSW": "switches", "false": "false"}
 
 
 def print_tracking_report(content: dict, console: Console) -> None:
-    """Scores by class in percent, and what they count."""
+    """Print scores by class in percent, and counts."""
     table = make_table(f"Tracking, {content['frames']} frames of {content['sequences']} "
                        f"sequences, {EGO_TITLES[content['ego']]}", "", *SHARES, *COUNTS, width=6)
     for name, row in content["classes"].items():
@@ -22,11 +22,11 @@ def print_tracking_report(content: dict, console: Console) -> None:
             table.add_row(name, *(f"{100 * row[key]:.1f}" for key in SHARES.values()),
                           *(str(row[key]) for key in COUNTS.values()))
     table.caption = ("HOTA and MOTA by centres within 2 m, sAMOTA by 3D IoU 0.25. IDSW: a track "
-                     "that took another number.")
+                     "that got a new id.")
     console.print(table)
     if content["without_pose"]:
         console.print(Text("no pose", "yellow") + f": {content['without_pose']} of "
-                      f"{content['frames']} frames, whose tracks go on as before, or relative to "
-                      "the sensor; see whether the odometry or TF of the recording has the clock "
-                      "of its clouds, or take --ego kiss_icp")
+                      f"{content['frames']} frames, whose tracks are extrapolated or relative to "
+                      "the sensor; check that the odometry or TF of the recording has the clock "
+                      "of its clouds, or use --ego kiss_icp")
     print_skipped(content["skipped"], console)

@@ -1,4 +1,4 @@
-"""What a user gets: the detections of a node or detector as they are, at the scores in use."""
+"""Precision, recall and F1 of detections at the default threshold."""
 
 from __future__ import annotations
 
@@ -20,9 +20,11 @@ LEVEL = "moderate"
 
 
 def score_at_threshold(frames: list[ComparedFrame]) -> dict[str, dict[str, float]]:
-    """By class: labels, hits, wrong, missed, and precision, recall and f1, 0 where they have no
-    cases; from above, at the relaxed overlap, for what KITTI calls moderate. All detections count,
-    whatever their score. Empty without frames."""
+    """Score all detections, whatever their score, by class.
+
+    BEV, relaxed overlap, moderate difficulty. Returns labels, hits, wrong, missed, precision,
+    recall and f1, ratios 0 without cases; empty without frames.
+    """
     if not frames:
         return {}
     concatenate = Comparison.of(frames)
@@ -42,13 +44,24 @@ def _score_class(concatenate: Comparison, name: str) -> dict[str, float]:
 def print_scores_at_threshold(
     content: dict[str, dict[str, float]], frames: int, console: Console
 ) -> None:
-    """The table of in_use(); classes that are neither there nor found are left out."""
-    table = make_table(f"Detections in use, {frames} frames", "", "overlap", "labels", "hits",
-                       "wrong", "missed", "prec.", "recall", "F1", width=6)
+    """Print the table of score_at_threshold(), without classes that have no objects."""
+    table = make_table(
+        f"Detections at the default threshold, {frames} frames",
+        "",
+        "overlap",
+        "labels",
+        "hits",
+        "wrong",
+        "missed",
+        "prec.",
+        "recall",
+        "F1",
+        width=6,
+    )
     for name, row in content.items():
         if row["labels"] or row["wrong"]:
             table.add_row(name, f"{RELAXED[name]:g}", *format_counts(row, "labels", "hits", "wrong",
                                                                      "missed"),
                           *format_percent(row, "precision", "recall", "f1"))
-    table.caption = "From above, by the protocol of KITTI, moderate."
+    table.caption = "BEV, by the protocol of KITTI, moderate."
     console.print(table)
