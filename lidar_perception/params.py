@@ -203,8 +203,8 @@ class PlayerParams(Params):
         "their answer on each, so that none is lost; the bag's time stands still meanwhile. Empty "
         "plays in real time, as a sensor sends.", fixed=True)
     ahead: int = param(1, "Clouds without an answer at a time, with `follow`. The nodes must have "
-                          "an `input.queue` as long, or they drop some.", low=1, high=1000,
-                       fixed=True)
+                          "an `input.queue` as long, or they drop some. 0: play in real time; the "
+                          "answers are only timed.", low=0, high=1000, fixed=True)
     follow_timeout: float = param(10.0, "Go on without an answer after this time, and count it.",
                                   unit="s", low=0.1, high=3600.0, fixed=True)
     wait_timeout: float = param(10.0, "Play without subscribers after this time; 0 does not wait.",

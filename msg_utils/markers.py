@@ -69,6 +69,18 @@ class MarkerRow(NamedTuple):
     points: np.ndarray | None = None
 
 
+class MarkerRows(NamedTuple):
+    """A MarkerArray as rows with a common header; read like a message by this module."""
+
+    rows: Sequence[MarkerRow]
+    header: Any
+    lifetime_ns: int = 0
+
+    @property
+    def markers(self) -> Sequence[MarkerRow]:
+        return self.rows
+
+
 def make_marker_rows(boxes: np.ndarray, labels: Sequence[str],
                      scores: Sequence[float] | np.ndarray | None = None, *,
                      ids: Sequence[int] | np.ndarray | None = None,
@@ -134,7 +146,10 @@ def rows_to_message(rows: Iterable[MarkerRow], header: Any, make: Any, lifetime_
 
 
 def from_marker_array(msg: Any) -> MarkedObjects:
-    """Return the objects of a MarkerArray of this module or of any node that sends CUBEs."""
+    """Return the objects of a MarkerArray of this module or of any node that sends CUBEs.
+
+    msg: a message, or MarkerRows.
+    """
     cubes = [m for m in msg.markers if m.action == ADD and m.type == CUBE]
     extras = [_parse_text(m.text) for m in cubes]
     scores = [_read_score(content) for content in extras]
@@ -151,6 +166,8 @@ def find_header(msg: Any) -> Any | None:
 
     Without a CUBE it is that of the first marker; None without markers.
     """
+    if isinstance(msg, MarkerRows):
+        return msg.header
     cubes = (m for m in msg.markers if m.action == ADD and m.type == CUBE)
     found = next(cubes, next(iter(msg.markers), None))
     return None if found is None else found.header
@@ -182,6 +199,9 @@ def compute_yaw(pose: Any) -> float:
 
 
 def _read_box(m: Any) -> list[float]:
+    if isinstance(m, MarkerRow):
+        z, w = m.quaternion
+        return [*m.position, *m.scale, math.atan2(2 * (w * z), 1 - 2 * (z * z))]
     p, s = m.pose.position, m.scale
     return [p.x, p.y, p.z, s.x, s.y, s.z, compute_yaw(m.pose)]
 

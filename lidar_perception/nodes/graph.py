@@ -13,7 +13,8 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -21,6 +22,7 @@ from typing import Any
 import yaml
 
 from lidar_perception.candidates.params import STEPS
+from lidar_perception.runs.machine import count_cores
 from lidar_perception.types import InputError
 from lidar_perception.wire.clouds import diagnose_packets, find_cloud_topics
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
@@ -39,6 +41,8 @@ TRUTH_INPUT = {"~/input/ground_truth": relative_name(TRUTH)}
 CLOUDS = {"~/input/points": relative_name(POINTS)}
 ODOMETRY_INPUT = {"~/input/odometry": relative_name(ODOMETRY)}
 TRACKER = "tracker"
+SEPARATOR = "---"  # between the arguments of the nodes of one process
+MAX_CORES_FOR_ONE_PROCESS = 4  # up to which the nodes of a graph share a process by default
 FINAL = "final"  # the last stage of a detector, whose boxes are its detections
 CLUSTERED = {"~/input/points": "clustering/output/points"}
 
@@ -124,6 +128,15 @@ def find_result_node(detector: str, single: bool = False) -> str:
     """Return the node that publishes the detections of a detector."""
     node, = (SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[detector]
     return node
+
+
+def prefers_one_process() -> bool:
+    """Return True on machines with few cores, where one process for a graph is the default.
+
+    It saves the CPU time for copies of clouds and most of the memory. The nodes share the lock of
+    the interpreter, so on more cores one process for each node has less latency.
+    """
+    return count_cores() <= MAX_CORES_FOR_ONE_PROCESS
 
 
 def list_result_topics(single: bool = False, detector: str = "candidates") -> dict[str, str]:
@@ -234,6 +247,7 @@ class Processes:
             self.environment.update(ROS_DOMAIN_ID=str(domain),
                                     ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
         self.running: dict[str, Any] = {}  # as subprocess.Popen
+        self._gathered: list[list[str]] | None = None  # arguments of nodes, see together()
 
     def __enter__(self) -> Processes:
         self.logs.mkdir(parents=True, exist_ok=True)
@@ -250,8 +264,20 @@ class Processes:
         rules = {**remap, **({"__ns": f"/{namespace}"} if namespace else {}),
                  **({"__node": node} if find_executable(node) != node else {})}
         remapping = [word for rule in rules.items() for word in ("-r", ":=".join(rule))]
-        self.run_node(name, [find_executable(node), "--ros-args", "--params-file", str(file),
-                             *remapping])
+        arguments = [find_executable(node), "--ros-args", "--params-file", str(file), *remapping]
+        if self._gathered is None:
+            self.run_node(name, arguments)
+        else:
+            self._gathered.append(arguments)
+
+    @contextmanager
+    def together(self, name: str) -> Iterator[None]:
+        """Start the nodes for which start() is called inside in one process of this name."""
+        parts: list[list[str]] = []
+        self._gathered = parts
+        yield
+        self._gathered = None
+        self.run_node(name, [word for part in parts for word in (SEPARATOR, *part)][1:])
 
     def run_node(self, name: str, arguments: Sequence[str]) -> None:
         """Start one of the executables of this package."""
@@ -286,6 +312,17 @@ class Processes:
             except (OSError, StopIteration):
                 continue
         return sizes
+
+    def cpu_seconds(self) -> dict[str, float]:
+        """Return the CPU time of each running process; empty without /proc."""
+        seconds = {}
+        for node, process in self.running.items():
+            try:  # proc(5): fields 14 and 15, counted from the state, the third, after the name
+                fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+                seconds[node] = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+            except (OSError, IndexError):
+                continue
+        return seconds
 
     def stop(self, timeout: float = 5.0) -> dict[str, int]:
         """Send SIGINT to all processes, SIGKILL after timeout seconds; return the exit codes."""

@@ -14,7 +14,7 @@ from lidar_perception.nodes.outputs import Obstacles
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import GroundNodeParams, GroundRobotParams
-from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import scatter_values
 from msg_utils.point_cloud2 import add_columns, from_array, to_array
 from msg_utils.stamps import to_ns
@@ -47,13 +47,13 @@ class GroundSegmentation(ManagedNode):
             indices, visible_frame = crop_to_view(frame, camera, params.view)
             ground = segment_ground(visible_frame, params.ground)
             indices = usable.take(indices)
-            self.points.publish(encode(add_columns(
+            self.points.publish(add_columns(
                 msg, bag_message, ground=scatter_values(ground, indices, msg, "u1"),
-                in_view=scatter_values(1, indices, msg, "u1"))))
+                in_view=scatter_values(1, indices, msg, "u1")))
         for publisher, chosen in ((self.ground, ground), (self.nonground, ~ground)):
             if publisher.get_subscription_count():
-                publisher.publish(encode(from_array(to_array(msg).take(indices[chosen]), msg.header,
-                                                    bag_message)))
+                publisher.publish(from_array(to_array(msg).take(indices[chosen]), msg.header,
+                                             bag_message))
         self.obstacles.publish(msg, visible_frame.xyz, ground, indices)
         plane = fit_plane(visible_frame.xyz.compress(ground, axis=0))
         if plane is not None:

@@ -1,4 +1,4 @@
-"""Arguments and nodes of the launch files; each node is one process.
+"""Arguments and nodes of the launch files, in one process or one for each node.
 
 The parameters of a node come from the package's own file, then from the files that the user gives,
 then from the other arguments; later values override earlier ones.
@@ -24,6 +24,7 @@ from lidar_perception.nodes.graph import (
     EXPERTS,
     NETWORKS,
     ODOMETRY_INPUT,
+    SEPARATOR,
     SINGLE,
     SINGLE_PROCESS_NODES,
     STAGES,
@@ -32,6 +33,7 @@ from lidar_perception.nodes.graph import (
     build_graph,
     find_executable,
     find_trackers,
+    prefers_one_process,
     relative_name,
 )
 from lidar_perception.nodes.node_parameters import find_node_parameters
@@ -88,6 +90,9 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
                      "the trackers and deskew."),
     "single": dict(**SWITCHES, description="Run each detector in one process that finds ground and "
                    "clusters itself."),
+    "processes": dict(default_value="auto", choices=["auto", "true", "false"], description="true: "
+                      "one process for each node; false: one process for all nodes; auto: one on "
+                      "machines with up to four cores."),
     "autostart": dict(default_value="true", choices=["true", "false"], description="false: a "
                       "lifecycle manager configures and activates the nodes."),
     "respawn": dict(**SWITCHES, description="Restart a node that has ended, for example after a "
@@ -179,7 +184,7 @@ def list_parameter_files(config: str, experts: str = "") -> list[str]:
 
 
 def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
-    """Return the launch nodes for the values of the arguments."""
+    """Return the launch nodes, one for each process, for the values of the arguments."""
     graph, detectors, single = _graph(value), _detectors(value), value["single"] == "true"
     prefix, users = value["name_prefix"], list_parameter_files(value["config"])
     files = {node: [_own_file(name, config_folder), *users] for name in detectors
@@ -189,15 +194,31 @@ def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
               for node in find_trackers(detectors)}
     topics = {relative_name(POINTS): value["points"], relative_name(ODOMETRY): value["odometry"]}
     viewer = [_viewer(value, config_folder)] if value["rviz"] == "true" else []
-    return viewer + [Node(
-        package="lidar_perception", executable=find_executable(base := node.removeprefix(prefix)),
-        name=node, namespace=value["namespace"] or None, output="screen",
+    common = {"package": "lidar_perception", "namespace": value["namespace"] or None,
+              "output": "screen", "ros_arguments": ["--log-level", value["log_level"]],
+              "respawn": value["respawn"] == "true", "respawn_delay": RESPAWN_DELAY_S}
+    nodes: list[dict[str, Any]] = [dict(
+        executable=find_executable(base := node.removeprefix(prefix)), name=node,
         parameters=add_arguments(files[base], node, _argument_parameters(value, base, detectors)),
         # A parameter file may make any node read odometry; for the others the remapping is void.
         remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_INPUT}.items()],
-        ros_arguments=["--log-level", value["log_level"]],
-        respawn=value["respawn"] == "true", respawn_delay=RESPAWN_DELAY_S,
     ) for node, remap in graph.items()]
+    if len(nodes) > 1 and (value["processes"] == "false" or (
+            value["processes"] == "auto" and prefers_one_process())):
+        words = [word for node in nodes for word in (SEPARATOR, *_list_arguments(**node))]
+        return [*viewer, Node(executable=words[1], arguments=[*words[2:], SEPARATOR],
+                              exec_name="graph", **common)]
+    return viewer + [Node(**node, **common) for node in nodes]
+
+
+def _list_arguments(executable: str, name: str, parameters: list[Any],
+                    remappings: list[tuple[str, str]]) -> list[str]:
+    """Return the arguments of a node in a process with others, see nodes.main.run."""
+    rules = [("__node", name), *remappings]
+    files = [each if isinstance(each, str) else _write_section(EVERY_NODE, values=each)
+             for each in parameters]
+    return [executable, "--ros-args", *(word for rule in rules for word in ("-r", ":=".join(rule))),
+            *(word for file in files for word in ("--params-file", file))]
 
 
 def _graph(value: dict[str, str]) -> dict[str, dict[str, str]]:
@@ -213,10 +234,15 @@ def add_arguments(files: list[str], node: str, given: dict[str, Any]) -> list[An
              if section != EVERY_NODE and is_for(section, node)]
     if not given or not named:
         return [*files, *filter(None, [given])]
+    return [*files, given, _write_section(*named, values=given)]
+
+
+def _write_section(*names: str, values: dict[str, Any]) -> str:
+    """Write a parameter file with these values in each section; return its path."""
     with tempfile.NamedTemporaryFile("w", prefix="launch_params_", suffix=".yaml",
                                      delete=False) as file:
-        yaml.safe_dump({section: {"ros__parameters": given} for section in named}, file)
-    return [*files, given, file.name]
+        yaml.safe_dump({name: {"ros__parameters": values} for name in names}, file)
+    return file.name
 
 
 def describe_conflicts(value: dict[str, str], config_folder: Path) -> list[str]:

@@ -11,12 +11,13 @@ import os
 import re
 import signal
 import sys
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import suppress
 from itertools import pairwise
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from lidar_perception.nodes import load_node_class, require_rclpy
+from lidar_perception.nodes import NODES, load_node_class, require_rclpy
 
 if TYPE_CHECKING:
     from lidar_perception.nodes.runtime import LidarNode
@@ -38,6 +39,12 @@ def run(name: str, arguments: list[str]) -> int:
     """Run a node until it is done or gets SIGINT or SIGTERM; return its exit code.
 
     The code is 0 after a signal, and 2 if the node cannot start.
+
+    Args:
+        name: executable of the node.
+        arguments: the same name, then arguments for ROS. After `---` may come another node for
+            the same process, and last, without a name, arguments of the process, such as
+            `--ros-args --log-level debug`.
     """
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     begin = perf_counter()
@@ -53,8 +60,9 @@ def run(name: str, arguments: list[str]) -> int:
         except BrokenPipeError:  # `| head`: keep Python from flushing again at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    nodes, shared = split_arguments(arguments)
     from lidar_perception.nodes.shared_memory import is_fed_by_driver, use_large_shared_memory
-    use_large_shared_memory(is_fed_by_driver(arguments))
+    use_large_shared_memory(any(map(is_fed_by_driver, nodes)))
     from lidar_perception.types import InputError
     try:
         require_rclpy()
@@ -64,13 +72,30 @@ def run(name: str, arguments: list[str]) -> int:
     from rclpy.logging import get_logger
 
     from lidar_perception.runs.compiling import lock_compilation, report_compilation
-    say = get_logger(_logger_name(arguments)).info
+    say = get_logger(_logger_name(nodes[0])).info
     with report_compilation(say):
-        node_class = load_node_class(name)
-        if warm_up := getattr(sys.modules[node_class.__module__], "warm_up", None):
-            with lock_compilation(say):
-                warm_up()
-    return _spin(node_class, arguments, begin, stop)
+        classes = [load_node_class(each[0]) for each in nodes]
+        modules = [sys.modules[node_class.__module__] for node_class in classes]
+        for warm_up in dict.fromkeys(getattr(module, "warm_up", None) for module in modules):
+            if warm_up:
+                with lock_compilation(say):
+                    warm_up()
+    if len(nodes) == 1 and not shared:
+        return _spin(classes[0], nodes[0], begin, stop)
+    return _spin_together(list(zip(classes, nodes)), shared, begin, stop)
+
+
+def split_arguments(arguments: list[str]) -> tuple[list[list[str]], list[str]]:
+    """Return the arguments of each node, and those of the process."""
+    from lidar_perception.nodes.graph import SEPARATOR
+    parts: list[list[str]] = [[]]
+    for word in arguments:
+        if word == SEPARATOR:
+            parts.append([])
+        else:
+            parts[-1].append(word)
+    nodes = [part for part in parts if part and part[0] in NODES]
+    return nodes, [word for part in parts if part not in nodes for word in part]
 
 
 def _logger_name(arguments: list[str]) -> str:
@@ -96,11 +121,12 @@ def _find_misspelt_sections(arguments: list[str], node: str) -> list[str]:
     return lines
 
 
-def _exit_process(node: LidarNode) -> None:
+def _exit_process(nodes: list[LidarNode]) -> None:
     """End the process while its work, such as a compilation, still runs."""
     import rclpy
     with suppress(Exception):
-        node.destroy_node()
+        for node in nodes:
+            node.destroy_node()
         rclpy.try_shutdown()
     os._exit(0)
 
@@ -110,47 +136,65 @@ def _spin(node_class: type, arguments: list[str], begin: float, stop: Stop) -> i
 
     begin is the perf_counter() at the start of the process.
     """
+    return _run_nodes([(node_class, arguments, {})], arguments, begin, stop)
+
+
+def _spin_together(nodes: list[tuple[type, list[str]]], shared: list[str], begin: float,
+                   stop: Stop) -> int:
+    """Create linked nodes and spin each in its own thread; return the exit code.
+
+    shared: arguments for ROS that are not of one of the nodes.
+    """
+    from lidar_perception.nodes.links import Links
+    links = Links()
+    return _run_nodes([(node_class, arguments, {"cli_args": arguments[1:], "links": links})
+                       for node_class, arguments in nodes], shared, begin, stop)
+
+
+def _run_nodes(given: list[tuple[type, list[str], dict[str, Any]]], shared: list[str],
+               begin: float, stop: Stop) -> int:
+    """Create nodes of these classes, arguments and options, spin them, and return the exit code."""
     import rclpy
     from rclpy.exceptions import NameValidationException, ParameterException
-    from rclpy.executors import SingleThreadedExecutor
     from rclpy.logging import get_logger
     from rclpy.signals import SignalHandlerOptions
 
-    from lidar_perception.nodes.node_parameters import describe_misspelt_parameters
-    from lidar_perception.nodes.rclpy_compat import (
-        RCLError,
-        UnknownROSArgsError,
-        parameter_overrides,
-    )
+    from lidar_perception.nodes.rclpy_compat import RCLError, UnknownROSArgsError
     from lidar_perception.runs.files import convert_os_errors
     from lidar_perception.types import InputError
 
-    log = get_logger(_logger_name(arguments))
-    node, code = None, 1
+    log = get_logger(_logger_name(given[0][1]))
+    nodes: list[LidarNode] = []
+    code = 1
     kept: BaseException | None = None  # keeps the entities of a node that failed to start
+
+    def end() -> None:
+        for node in nodes:
+            node.stop.set_result(None)
+
     try:
         stop.on_signal = lambda: None  # DDS must be shut down from here on, see stop.requested
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        with convert_os_errors():
-            node = node_class()
-        stop.on_signal = lambda: node.stop.set_result(None)
-        if not node.writes_files:
-            stop.force_exit = lambda: _exit_process(node)
+        rclpy.init(args=shared, signal_handler_options=SignalHandlerOptions.NO)
+        for node_class, arguments, options in given:
+            log = get_logger(_logger_name(arguments))
+            with convert_os_errors():
+                nodes.append(node_class(**options))
+        stop.on_signal = end
+        if not any(node.writes_files for node in nodes):
+            stop.force_exit = lambda: _exit_process(nodes)
         if stop.requested:
-            node.stop.set_result(None)
-        undeclared = [name for name in parameter_overrides(node) if not node.has_parameter(name)]
-        for line in [*describe_misspelt_parameters(undeclared),
-                     *_find_misspelt_sections(arguments, node.get_name())]:
-            node.get_logger().warning(line)  # before any long work
-        if not node.stop.done():
-            node.start()
-        if not node.stop.done():
-            if node.is_ready():
-                node.get_logger().info("ready: code loaded and warmed up in "
-                                       f"{perf_counter() - begin:.1f} s")
-            executor = SingleThreadedExecutor()
-            executor.add_node(node)
-            node.spin(executor)
+            end()
+        if len(nodes) == 1:
+            _spin_node(nodes[0], given[0][1], begin)
+        else:
+            with ThreadPoolExecutor(len(nodes)) as pool:
+                spinning = [pool.submit(_spin_node, node, arguments, begin)
+                            for node, (_, arguments, _) in zip(nodes, given)]
+                if any(future.exception() for future in wait(spinning, None, FIRST_EXCEPTION).done):
+                    end()
+            for node, future in zip(nodes, spinning):
+                log = node.get_logger()
+                future.result()
         code = 0
     except UnknownROSArgsError as error:
         log.fatal(f"unknown argument after --ros-args: {error}")
@@ -160,18 +204,39 @@ def _spin(node_class: type, arguments: list[str], begin: float, stop: Stop) -> i
         kept, code = error, 2
     finally:
         stop.begin_closing()
-        if node is not None:
+        for node in nodes:
             try:
                 node.close()
             except InputError as error:  # its results cannot be written
                 node.get_logger().fatal(str(error))
                 code = code or 1
         stop.finish_closing(code)
-        if node is not None:
+        for node in nodes:
             node.destroy_node()
         del kept  # shuts down DDS here, where the guard ends a hang
         rclpy.try_shutdown()
     return code
+
+
+def _spin_node(node: LidarNode, arguments: list[str], begin: float) -> None:
+    """Start a node and spin it until it is to stop."""
+    from rclpy.executors import SingleThreadedExecutor
+
+    from lidar_perception.nodes.node_parameters import describe_misspelt_parameters
+    from lidar_perception.nodes.rclpy_compat import parameter_overrides
+    undeclared = [name for name in parameter_overrides(node) if not node.has_parameter(name)]
+    for line in [*describe_misspelt_parameters(undeclared),
+                 *_find_misspelt_sections(arguments, node.get_name())]:
+        node.get_logger().warning(line)  # before any long work
+    if not node.stop.done():
+        node.start()
+    if not node.stop.done():
+        if node.is_ready():
+            node.get_logger().info("ready: code loaded and warmed up in "
+                                   f"{perf_counter() - begin:.1f} s")
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        node.spin(executor)
 
 
 if __name__ == "__main__":

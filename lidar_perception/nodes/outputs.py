@@ -21,10 +21,10 @@ from lidar_perception.nodes.track_outputs import (
 )
 from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
-from lidar_perception.wire.array_codec import encode_detection_array, encode_markers
-from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.array_codec import encode_detection_array
+from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_detection_rows, make_xyz_cloud
-from msg_utils.markers import list_marker_keys, make_marker_rows
+from msg_utils.markers import MarkerRows, list_marker_keys, make_marker_rows
 from msg_utils.messages import load_message_class
 from msg_utils.stamps import make_header, to_ns
 
@@ -56,7 +56,7 @@ class ClusterBoxes:
             rows = make_marker_rows(output, ["cluster"] * len(output), ids=ids,
                                     previous=self.marker_keys, extras=_marker_texts(output, ids))
             self.marker_keys = list_marker_keys(rows)
-            self.publisher.publish(encode_markers(rows, header, find_marker_lifetime_ns(self.node)))
+            self.publisher.publish(MarkerRows(rows, header, find_marker_lifetime_ns(self.node)))
 
 
 def _marker_texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
@@ -89,9 +89,9 @@ class Obstacles:
             params = self.node.transforms.with_mounting(self.node.params, placing)
             chosen = find_obstacles(xyz, ground, self.node.node_params.obstacles,
                                     params.ground.sensor_pose)
-            self.publisher.publish(encode(make_xyz_cloud(
+            self.publisher.publish(make_xyz_cloud(
                 msg, placing.to_cloud_frame(xyz.compress(chosen, axis=0)), indices.compress(chosen),
-                bag_message)))
+                bag_message))
 
 
 class DetectionMarkers:
@@ -106,7 +106,7 @@ class DetectionMarkers:
         """Publish detections that are in the frame of the header."""
         rows = make_detection_rows(detections, self.marker_keys, clusters)
         self.marker_keys = list_marker_keys(rows)
-        self.publisher.publish(encode_markers(rows, header, find_marker_lifetime_ns(self.node)))
+        self.publisher.publish(MarkerRows(rows, header, find_marker_lifetime_ns(self.node)))
 
 
 class DetectionOutputs:

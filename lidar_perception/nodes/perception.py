@@ -15,7 +15,7 @@ from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes, Obsta
 from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import PerceptionRobotParams
-from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import scatter_values
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
@@ -50,9 +50,9 @@ class Perception(ManagedNode):
                                  lambda: refine_segmented(segmented, source, params), problem)
         indices = usable.take(segmented.indices)
         if self.points.get_subscription_count():
-            self.points.publish(encode(add_columns(
+            self.points.publish(add_columns(
                 msg, bag_message, ground=scatter_values(segmented.ground, indices, msg, "u1"),
                 in_view=scatter_values(1, indices, msg, "u1"),
-                cluster_id=scatter_values(segmented.cluster_ids, indices, msg, "u4"))))
+                cluster_id=scatter_values(segmented.cluster_ids, indices, msg, "u4")))
         self.boxes.publish(msg.header, lambda: segmented.boxes)
         self.obstacles.publish(msg, segmented.xyz, segmented.ground, indices)

@@ -4,27 +4,24 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.resources import files
 from time import monotonic
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from lidar_perception.nodes.rclpy_compat import parameter_overrides, take_messages
+from lidar_perception.nodes.arrivals import DEPTH, WINDOW, Arrivals
+from lidar_perception.nodes.links import Output
+from lidar_perception.nodes.rclpy_compat import InvalidHandle, parameter_overrides, take_messages
 from lidar_perception.nodes.shared_memory import SOCKET_BUFFER, read_socket_buffer_size
 from lidar_perception.params import ReceptionParams
 
 WARN, ERROR, STALE = DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
-DEPTH = 5
-WINDOW = 100            # sent clouds, for the shares of lost and dropped ones
-RATE_SAMPLES = 20       # intervals between clouds, whose median is the expected one
-RATE_INTERVALS = 10     # intervals, whose mean gives the present rate
 MAX_HOLD_S = 1.0        # for which newer clouds do not replace a waiting one
 RETRY_PERIOD_S = 5.0    # between attempts to wait again after waiting has timed out
 RETRY_DURATION_S = 0.3  # of such an attempt
@@ -45,76 +42,6 @@ FASTDDS_PROFILE = files("lidar_perception.nodes") / "fastdds.xml"
 Problem = tuple[str, bytes, str]  # kind, level, message
 
 
-class Arrivals:
-    """Count received, dropped and lost clouds (sent = received + dropped + lost).
-
-    Publishers number their messages (publication_sequence_number). A gap counts as lost on the way
-    or, if the queue was full, as dropped from the queue.
-    """
-
-    def __init__(self, depth: int = DEPTH):
-        self.depth = depth
-        self.sent = self.dropped = self.lost = 0
-        self.sequence: int | None = None  # number of the last cloud
-        self.window: deque[tuple[int, int, int]] = deque([(0, 0, 0)], WINDOW + 1)
-        self.stamps: deque[tuple[int, int]] = deque(maxlen=RATE_SAMPLES + 1)  # sent, ns
-        self.learned: float | None = None  # expected rate, Hz
-
-    def add(self, infos: list[dict], dropped: int, one_publisher: bool = True) -> None:
-        """Count messages.
-
-        Args:
-            infos: message infos of rclpy, of all messages that were waiting, oldest first.
-            dropped: how many of them are not processed.
-            one_publisher: False with several publishers, whose numbers cannot be compared.
-        """
-        full = len(infos) >= self.depth
-        for i, info in enumerate(infos):
-            number, gap = info["publication_sequence_number"], 0
-            if one_publisher and number and self.sequence is not None and number > self.sequence:
-                gap = number - self.sequence - 1
-            self.sequence = (number or None) if one_publisher else None
-            if full and i == 0:
-                self.dropped += gap
-            else:
-                self.lost += gap
-            self.sent += 1 + gap
-            self.stamps.append((self.sent, info["source_timestamp"]))
-        self.dropped += dropped
-        self.window.append((self.sent, self.lost, self.dropped))
-        if self.learned is None and len(self.stamps) > RATE_SAMPLES:
-            intervals = np.diff(np.array(self.stamps, float), axis=0)
-            period = np.median(intervals[:, 1] / intervals[:, 0])
-            self.learned = 1e9 / period if period > 0 else None
-
-    def record_interruption(self, dropped: int) -> None:
-        """Count the waiting clouds as dropped, and ignore the clouds until the next one."""
-        self.dropped += dropped
-        self.sequence = None
-        self.stamps.clear()
-        self.reset_window()
-
-    def reset_window(self) -> None:
-        """Restart the window of count_recent(), because the cause of earlier drops is over."""
-        self.window.clear()
-        self.window.append((self.sent, self.lost, self.dropped))
-
-    def count_recent(self) -> tuple[int, int, int]:
-        """Return (sent, lost, dropped) of the last WINDOW sent clouds, or more after a long gap."""
-        now = self.window[-1]
-        before = next((w for w in reversed(self.window) if now[0] - w[0] >= WINDOW),
-                      self.window[0])
-        sent, lost, dropped = (a - b for a, b in zip(now, before))
-        return sent, lost, dropped
-
-    def measure_rate(self) -> float | None:
-        """Return the present rate of sent clouds in Hz, or None while too few have arrived."""
-        if len(self.stamps) <= RATE_INTERVALS:
-            return None
-        (n0, t0), (n1, t1) = self.stamps[-1 - RATE_INTERVALS], self.stamps[-1]
-        return 1e9 * (n1 - n0) / (t1 - t0) if t1 > t0 else None
-
-
 class Reception:
     """A subscription to clouds, or to arrays made from clouds.
 
@@ -122,19 +49,23 @@ class Reception:
     half of the 2 MB clouds of an ordinary driver. A BEST_EFFORT publisher, also a later one, makes
     it BEST_EFFORT, as its clouds would not arrive otherwise. qos_overrides take precedence.
 
+    If the only publisher of the topic is a node of the same process, its messages come by a link
+    instead of a subscription, see links.py.
+
     Args:
-        node: the node that subscribes.
+        node: the LidarNode that subscribes.
         kind: class of the message.
         name: name of the topic.
-        deliver: called with the bytes of each of the newest input.queue clouds, and with whether
-            the cloud may wait. Returns what the cloud still needs, or None. A cloud that may wait
-            (up to input.max_wait seconds) and needs something is delivered again at retry().
+        deliver: called with each of the newest input.queue clouds, as CDR or as a message of a
+            link, and with whether the cloud may wait. Returns what the cloud still needs, or None.
+            A cloud that may wait (up to input.max_wait seconds) and needs something is delivered
+            again at retry().
         params: returns the present parameters of the group input.
         what: name of one message in diagnostics.
     """
 
-    def __init__(self, node: Node, kind: type, name: str,
-                 deliver: Callable[[bytes, bool], str | None],
+    def __init__(self, node: Any, kind: type, name: str,
+                 deliver: Callable[[Any, bool], str | None],
                  params: Callable[[], ReceptionParams], what: str = "cloud"):
         self.node, self.kind, self.deliver, self.params = node, kind, deliver, params
         self.what = what
@@ -142,30 +73,63 @@ class Reception:
         self.fixed = (f"qos_overrides.{self.topic}.subscription.reliability"
                       in parameter_overrides(node))
         self.reliability = BEST_EFFORT if params().reliability == "best_effort" else RELIABLE
-        self.waiting: deque[bytes] = deque()
+        self.waiting: deque[Any] = deque()
+        self.linked: deque[tuple[Any, dict]] = deque()  # messages of a link, see _receive
         self.deliver_trigger = node.create_guard_condition(self._deliver_one)
         self.adapt_trigger = node.create_guard_condition(self.adapt)
+        self.link_trigger = node.create_guard_condition(self._take_linked)
         self.last_time: float | None = None  # monotonic time of the last cloud
         self.needs: str | None = None  # what the waiting or the last cloud needs
         self.needed_since: float | None = None  # monotonic
         self.waiting_since: float | None = None  # monotonic, of the first waiting cloud
+        self.output: Output | None = None  # to which the topic is linked, without a subscription
         self.subscription: Any = None
         self.last_publishers: list[Any] = []  # the present ones, if there are any
         self.arrivals = Arrivals()
 
+    @property
+    def is_open(self) -> bool:
+        return self.subscription is not None or self.output is not None
+
     def open(self) -> None:
         """Subscribe."""
-        self._subscribe()
+        if self.node.links is not None:
+            self.node.links.watch(self.topic, self._on_link_change)
+        self._connect()
         self.adapt()
 
     def close(self) -> None:
         """End the subscription. Waiting clouds are dropped; later ones do not count as lost."""
-        if self.subscription is not None:
-            self.node.destroy_subscription(self.subscription)
-        self.subscription = self.last_time = None
+        if self.node.links is not None:
+            self.node.links.unwatch(self.topic, self._on_link_change)
+        self._disconnect()
+        self.last_time = None
         self.needs = self.needed_since = self.waiting_since = None
         self.arrivals.record_interruption(len(self.waiting))
         self.waiting.clear()
+
+    def _connect(self) -> None:
+        """Link to an output of this process, or subscribe."""
+        self.output = self._find_output()
+        if self.output is None:
+            self._subscribe()
+        else:
+            self.linked = deque(maxlen=max(DEPTH, self.params().queue))
+            self.arrivals.depth = self.linked.maxlen or DEPTH
+            self.node.links.connect(self.output, self._receive)
+
+    def _disconnect(self) -> None:
+        if self.output is not None:
+            self.node.links.disconnect(self.output, self._receive)
+            self.linked.clear()
+        if self.subscription is not None:
+            self.node.destroy_subscription(self.subscription)
+        self.output = self.subscription = None
+
+    def _find_output(self) -> Output | None:
+        """Return the output of this process that is the only publisher of the topic, or None."""
+        output = self.node.links and self.node.links.find_output(self.topic)
+        return output if output is not None and len(self.publishers()) < 2 else None
 
     def _subscribe(self) -> None:
         """Subscribe with a queue in the middleware for clouds that arrive during work."""
@@ -185,8 +149,16 @@ class Reception:
         return self.node.get_publishers_info_by_topic(self.topic)
 
     def adapt(self) -> None:
-        """Subscribe again if the publishers offer another reliability than before."""
-        if self.subscription is None:
+        """Connect again if the publishers are others, or offer another reliability, than before."""
+        if not self.is_open:
+            return
+        if self._find_output() is not self.output:
+            self._disconnect()
+            self._connect()
+            self.arrivals.record_interruption(0)
+            self.node.get_logger().info(f"{self.topic} is received {self._reliability_label()} now")
+        if self.output is not None:
+            self.last_publishers = self.publishers() or self.last_publishers
             return
         wanted, publishers = self.params().reliability, self.publishers()
         self.last_publishers = publishers or self.last_publishers
@@ -204,15 +176,30 @@ class Reception:
         self.node.get_logger().info(f"{self.topic} is received {self._reliability_label()} now")
 
     def _reliability_label(self) -> str:
+        if self.output is not None:
+            return "in this process"
         return self.subscription.qos_profile.reliability.name.lower().replace("_", " ")
 
     def _on_message(self, data: bytes, info: dict) -> None:
         """Take all messages from the middleware, which does not count the ones it drops."""
-        infos = [info]
-        self.waiting.append(data)
-        for later, later_info in take_messages(self.subscription, self.kind):
-            self.waiting.append(later)
-            infos.append(later_info)
+        taken = [(data, info), *take_messages(self.subscription, self.kind)]
+        self._accept(taken, one_publisher=len(self.publishers()) < 2)
+
+    def _receive(self, message: Any, info: dict) -> None:
+        """Keep a message of a link; called in the thread of its publisher."""
+        self.linked.append((message, info))
+        _trigger(self.link_trigger)
+
+    def _on_link_change(self) -> None:
+        _trigger(self.adapt_trigger)
+
+    def _take_linked(self) -> None:
+        if taken := [self.linked.popleft() for _ in range(len(self.linked))]:
+            self._accept(taken, one_publisher=True)
+
+    def _accept(self, taken: list[tuple[Any, dict]], one_publisher: bool) -> None:
+        """Keep the newest messages, count all and deliver the first one."""
+        self.waiting.extend(message for message, _ in taken)
         # Newer clouds do not replace one that has waited for its pose only briefly. Otherwise no
         # cloud would ever be processed if poses arrive later than the next cloud.
         is_held = self.waiting_since is not None and monotonic() - self.waiting_since < MAX_HOLD_S
@@ -222,7 +209,7 @@ class Reception:
             self.waiting.popleft()
             self.waiting_since = self.waiting_since if is_held else None
         self.waiting.extendleft(oldest)
-        self.arrivals.add(infos, dropped, one_publisher=len(self.publishers()) < 2)
+        self.arrivals.add([info for _, info in taken], dropped, one_publisher)
         self._deliver_one()
 
     def _deliver_one(self) -> None:
@@ -259,7 +246,7 @@ class Reception:
 
     def values(self) -> dict[str, Any]:
         """Return the values for the diagnostics."""
-        if self.subscription is None:
+        if not self.is_open:
             return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped}
         rate, expected = self.arrivals.measure_rate(), self.expected_rate()
         return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped,
@@ -273,7 +260,7 @@ class Reception:
 
     def problems(self) -> list[Problem]:
         """Return the present problems of the topic with their remedies."""
-        if self.subscription is None:
+        if not self.is_open:
             return []
         problems, params = [], self.params()
         publishers = self.publishers()
@@ -333,7 +320,8 @@ class Reception:
         """Return a problem for best-effort publishers that adapt() may not adapt to."""
         names = [_name(p) for p in publishers if p.qos_profile.reliability == BEST_EFFORT]
         adapts = not self.fixed and self.params().reliability != "reliable"
-        if not names or adapts or self.subscription.qos_profile.reliability != RELIABLE:
+        if not names or adapts or self.output is not None or (
+                self.subscription.qos_profile.reliability != RELIABLE):
             return None
         remedy = (f"set qos_overrides.{self.topic}.subscription.reliability to best_effort"
                   if self.fixed else "set input.reliability to auto")
@@ -348,10 +336,16 @@ class Reception:
                       "node again") if read_socket_buffer_size() < SOCKET_BUFFER else ""
             return (f"let {_name(publishers[0])} publish reliable, or start it with "
                     f"FASTRTPS_DEFAULT_PROFILES_FILE={FASTDDS_PROFILE}{sysctl}")
-        if self.subscription.qos_profile.reliability == BEST_EFFORT:
+        if self.output is None and self.subscription.qos_profile.reliability == BEST_EFFORT:
             return "receive it reliable: input.reliability auto, and no qos_overrides"
         return ("raise the depth of the publisher's queue; between machines also net.core.rmem_max "
                 "(sysctl)")
+
+
+def _trigger(guard: Any) -> None:
+    """Trigger a guard condition of a node, which another thread may be destroying."""
+    with suppress(InvalidHandle):
+        guard.trigger()
 
 
 def _name(endpoint: Any) -> str:

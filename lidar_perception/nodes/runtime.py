@@ -25,6 +25,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 from std_msgs.msg import Float64
 
+from lidar_perception.nodes.links import Links, Output
 from lidar_perception.nodes.parameter_declaration import (
     convert_to_declared_type,
     declare_parameters,
@@ -59,14 +60,18 @@ class LidarNode(Node):
             parameters, and changes at run time are checked in the same way.
         node_params: dataclass with the other parameters, such as CloudNodeParams or BoxNodeParams,
             for nodes that subscribe to clouds.
+        links: links to the other nodes of the process, None if there are none.
         options: further arguments of rclpy.node.Node.
     """
 
     transforms: Any = None  # of type Transforms for nodes that subscribe to clouds
     writes_files: ClassVar[bool] = False  # True: after a signal the work is finished, for close()
 
-    def __init__(self, name: str, params: Any, node_params: Any = None, **options: Any):
+    def __init__(self, name: str, params: Any, node_params: Any = None,
+                 links: Links | None = None, **options: Any):
         super().__init__(name, **options)
+        self.links = links
+        self._outputs: list[Output] = []
         self.params = declare_parameters(self, params)
         self.node_params = node_params and declare_parameters(self, node_params)
         self.add_pre_set_parameters_callback(self._before_set)
@@ -90,7 +95,9 @@ class LidarNode(Node):
         self.times: list[float] = []
         self.frame_id = ""  # of the last cloud
         self.inputs: list[Any] = []  # with open() and close()
-        self._outputs: list[Any] = []
+        for output in self._outputs:
+            output.close()
+        self._outputs = []
 
     def add_steady_timer(self, seconds: float, callback: Callable[[], None]) -> None:
         """Call callback() periodically, also while the clock of a simulation stands still."""
@@ -144,10 +151,10 @@ class LidarNode(Node):
         name = f"~/input/{topic}" if private else topic
         _warm_up_type(type_name)
 
-        def receive(data: bytes, patient: bool = False) -> str | None:
+        def receive(data: Any, patient: bool = False) -> str | None:
             missing = None
             try:
-                msg = decode_message(data, type_name)
+                msg = decode_message(data, type_name) if isinstance(data, bytes) else data
                 if type_name == CLOUD:
                     self.frame_id = msg.header.frame_id
                     missing = self.transforms.find_missing_input(msg)
@@ -196,18 +203,15 @@ class LidarNode(Node):
             for new_input in inputs:
                 new_input.open()
 
-    def output(self, topic: str, type_name: str, qos: QoSProfile = RELIABLE):
-        """Create a publisher of ~/output/TOPIC, or of any name that starts with ~ or /.
-
-        It publishes encode()d messages.
-        """
+    def output(self, topic: str, type_name: str, qos: QoSProfile = RELIABLE) -> Output:
+        """Create a publisher of ~/output/TOPIC, or of any name that starts with ~ or /."""
         name = topic if topic[0] in "~/" else f"~/output/{topic}"
         _warm_up_type(type_name)
-        publisher = self.create_publisher(
+        output = Output(self.create_publisher(
             load_message_class(type_name), name, qos,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
-        self._outputs.append(publisher)
-        return publisher
+            qos_overriding_options=QoSOverridingOptions.with_default_policies()), self.links)
+        self._outputs.append(output)
+        return output
 
     def report(self, level: bytes, message: str, expected: bool = False) -> None:
         """Set the diagnostic state.
@@ -267,8 +271,8 @@ class LidarNode(Node):
                 values[name] = sum(numbers, self.counts.get(name, 0))
         if self.times:
             values["processing_ms_median"] = f"{np.median(self.times):.1f}"
-        for publisher in self._outputs:
-            values[f"subscribers of {publisher.topic_name}"] = publisher.get_subscription_count()
+        for output in self._outputs:
+            values[f"subscribers of {output.topic_name}"] = output.get_subscription_count()
         if problems := self._problems():
             level = max(level, *(p[1] for p in problems))
             message = f"{'; '.join(p[2] for p in problems)} (state: {message})"

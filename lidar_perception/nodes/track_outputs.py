@@ -17,9 +17,9 @@ from lidar_perception.tracking.state import Tracks
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import Detections
-from lidar_perception.wire.array_codec import encode_detection_array, encode_markers
+from lidar_perception.wire.array_codec import encode_detection_array
 from lidar_perception.wire.track_markers import make_track_rows
-from msg_utils.markers import list_marker_keys
+from msg_utils.markers import MarkerRows, list_marker_keys
 from msg_utils.messages import load_message_class
 from msg_utils.stamps import SECOND_NS, to_ns
 
@@ -97,7 +97,7 @@ class TrackOutputs:
                 {"seen": bool(seen), "age": round(float(age), 3)}
                 for seen, age in zip(tracks.seen, tracks.ages)])
         self.marker_keys = list_marker_keys(rows)
-        self.markers.publish(encode_markers(rows, header, find_marker_lifetime_ns(self.node)))
+        self.markers.publish(MarkerRows(rows, header, find_marker_lifetime_ns(self.node)))
         if self.array is not None and self.array.get_subscription_count():
             detections = tracks.detections
             self.array.publish(encode_detection_array(

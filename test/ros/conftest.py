@@ -62,9 +62,9 @@ def start(domain):
         node.start()
         assert node.active
         node.sent = {}
-        for publisher in node._outputs:
-            publisher.publish = node.sent.setdefault(
-                publisher.topic_name.rpartition("/")[2], []).append
+        for output in node._outputs:
+            output.publisher.publish = node.sent.setdefault(
+                output.topic_name.rpartition("/")[2], []).append
         return node
 
     yield make

@@ -31,35 +31,37 @@ from msg_utils.point_cloud2 import to_array
 PAPER = with_values(PipelineParams(), {"view.enabled": True, "seed.source": "ground_truth"})
 
 
-RUNS = {  # one process?, parameters beside the protocol
-    "three nodes of paper C": (False, {"ground.method": "cloth", "clustering.method": "euclidean",
-                                       "boxes.shape": "l_shape"}),
-    "one node, patchwork": (True, {"ground.method": "patchwork", "boxes.shape": "min_area",
+PAPER_C = {"ground.method": "cloth", "clustering.method": "euclidean", "boxes.shape": "l_shape"}
+RUNS = {  # (single, processes, parameters in addition to PAPER)
+    "three nodes of paper C": (False, True, PAPER_C),
+    "the same in one process": (False, False, PAPER_C),
+    "one node, patchwork": (True, True, {"ground.method": "patchwork", "boxes.shape": "min_area",
                                    "clustering.dbscan.join_bands": True}),
 }
 
 
 @pytest.fixture(scope="module", params=RUNS.values(), ids=RUNS)
 def setting(request):
-    single, values = request.param
-    return single, with_values(PAPER, values)
+    single, processes, values = request.param
+    return single, processes, with_values(PAPER, values)
 
 
 @pytest.fixture(scope="module")
 def run(setting, drive_bag, tmp_path_factory):
     """One replay: whether in one process, its scores, and the folder with the result bag."""
-    single, params = setting
+    single, processes, params = setting
     out = tmp_path_factory.mktemp("run")
     with Bag(drive_bag) as bag, pytest.MonkeyPatch.context() as patch:
         clouds = bag.counts[POINTS]
         patch.setattr("lidar_perception.nodes.replay.graph_replay.Processes", NodesUnderTest)
-        return single, replay(drive_bag, clouds, out, params, single=single), out
+        return single, replay(drive_bag, clouds, out, params, single=single,
+                              processes=processes), out
 
 
 @pytest.fixture(scope="module")
 def offline(setting, drive_bag):
     """Stamp -> what the offline pipeline finds; and its report."""
-    report, results, params = CandidateReport(), {}, setting[1]
+    report, results, params = CandidateReport(), {}, setting[-1]
     for frame in open_recording(drive_bag):
         people = select_pedestrians(frame.truth())
         if len(people):

@@ -12,6 +12,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from lidar_perception.nodes.graph import build_graph
+from lidar_perception.nodes.main import split_arguments
 from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.nodes.param_files import read_sections
 from lidar_perception.types import InputError
@@ -66,6 +67,7 @@ def launched(description):
 
         def nodes(**given):
             assert set(given) <= set(arguments)
+            given = {"processes": "true", **given}
             context = SimpleNamespace(
                 perform_substitution=lambda s: {**arguments, **given}[s.args[0]])
             actions = start(context)
@@ -117,6 +119,35 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
     assert all(n.parameters[1]["input.ahead"] == 180.0 for n in nodes(ahead="180").values())
     with pytest.raises(InputError, match="ahead:=left is not a number"):
         nodes(ahead="left")
+
+
+@pytest.mark.parametrize(("processes", "cores", "together"), [
+    ("auto", 4, True), ("auto", 5, False), ("true", 1, False), ("false", 64, True)])
+def test_graph_is_one_process_on_few_cores(processes, cores, together, launched, monkeypatch):
+    _, nodes = launched("detectors")
+    monkeypatch.setattr("lidar_perception.nodes.graph.count_cores", lambda: cores)
+    given = dict(processes=processes, tracking="true", namespace="left", range="around",
+                 points="/cloud", log_level="debug", respawn="true")
+    started = nodes(**given)
+    graph = build_graph(["fused"], tracking=True)
+    assert len(started) == (1 if together else len(graph))
+    assert len(nodes(**given | {"tracking": "false"}, single="true")) == 1
+    if not together:
+        return
+    node, = started.values()
+    assert (node.namespace, node.respawn, node.ros_arguments) == (
+        "left", True, ["--log-level", "debug"])
+    parts, shared = split_arguments([node.executable, *node.arguments, "--ros-args", "-r", "a:=b"])
+    assert [part[0] for part in parts] == [*graph] and shared == ["--ros-args", "-r", "a:=b"]
+    for part, name in zip(parts, graph):
+        alone = nodes(**given | {"processes": "true"})[name]
+        options = list(zip(part[2::2], part[3::2]))
+        assert [tuple(rule.split(":=")) for option, rule in options if option == "-r"] == [
+            ("__node", name), *alone.remappings]
+        files = [file for option, file in options if option == "--params-file"]
+        for file, parameters in zip(files, alone.parameters, strict=True):
+            assert read_sections(file) == (read_sections(parameters) if isinstance(parameters, str)
+                                           else {"/**": parameters})
 
 
 def test_ground_and_cluster_file_rejects_other_arguments(launched, tmp_path):

@@ -112,7 +112,7 @@ def test_static_transforms_accumulate_others_keep_last(
     player._publish_latched()
     assert [decode(d, TEXT).data for d in player.sent["tf_static"]] == [*map(str, range(20))]
     assert [decode(d, INFO).width for d in player.sent["info"]] == [19]
-    depths = {p.topic_name: p.qos_profile.depth for p in player._outputs}
+    depths = {o.topic_name: o.publisher.qos_profile.depth for o in player._outputs}
     assert depths == {"/tf_static": 100, "/info": 10, "/text": 10}  # also for who comes late
 
 

@@ -19,16 +19,10 @@ from rclpy.executors import SingleThreadedExecutor
 from test_bad_input import CLOUD, MARKERS, cloud
 
 from lidar_perception.nodes import reception as reception_module
+from lidar_perception.nodes.arrivals import RATE_INTERVALS
 from lidar_perception.nodes.graph import STAGES
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
-from lidar_perception.nodes.reception import (
-    BEST_EFFORT,
-    RATE_INTERVALS,
-    RELIABLE,
-    WINDOW,
-    Arrivals,
-    Reception,
-)
+from lidar_perception.nodes.reception import BEST_EFFORT, RELIABLE, WINDOW, Arrivals, Reception
 from lidar_perception.nodes.runtime import LATCHED
 from lidar_perception.nodes.runtime import RELIABLE as RELIABLE_QOS
 from lidar_perception.nodes.shared_memory import (

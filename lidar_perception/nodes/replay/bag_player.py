@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import warnings
 from collections import deque
+from statistics import median
 from time import monotonic
 from typing import Any
 
@@ -29,6 +30,7 @@ from msg_utils.stamps import SECOND_NS, make_time
 
 SERVICE_PERIOD_S = 0.05  # between calls of services while messages are late
 MIN_LOOP_S = 0.1
+ANSWER_POLL_S = 0.2  # while waiting for answers, which end a wait earlier
 UNCOUNTED_SUFFIXES = "_ms", "_3d"  # topics whose subscribers are not in the diagnostics
 
 
@@ -53,6 +55,7 @@ class BagPlayer(LidarNode):
                           if self.bag.topics[t] != POINT_CLOUD}
         self.kinds = {t: POINT_CLOUD if t in self.converted else kind
                       for t, kind in self.bag.topics.items()}
+        self.follows = bool(self.params.follow and self.params.ahead)  # clouds wait for answers
         self.names = self._select_topics()
         self.publishers_by_topic = {t: p for t in self.names if (p := self._make_publisher(t))}
         if not self.publishers_by_topic:
@@ -126,7 +129,7 @@ class BagPlayer(LidarNode):
         kind = self.kinds[topic]
         try:
             return self.output(self.names[topic], kind, _qos(
-                self.bag.qos(topic), self._count_latched(topic), lossless=bool(self.params.follow)))
+                self.bag.qos(topic), self._count_latched(topic), lossless=self.follows)).publisher
         except (ModuleNotFoundError, AttributeError):
             self.get_logger().warning(f"{topic} is not played: {kind} is not installed here")
             return None
@@ -193,12 +196,12 @@ class BagPlayer(LidarNode):
         played = [p for p in self.publishers_by_topic.values() if p.topic_name == resolved]
         if played:
             return played[0].get_subscription_count()
-        discovered, node = self.count_subscribers(resolved), resolved.rsplit("/", 2)[0]
+        node = resolved.rsplit("/", 2)[0]
         if resolved.endswith(UNCOUNTED_SUFFIXES) or not self.count_publishers(
                 f"{node}/debug/processing_time_ms"):
-            return discovered  # not an output of a node of this package
-        values = self.diagnostic_values.get(node, {})
-        return min(discovered, int(values.get(f"subscribers of {resolved}", 0)))
+            return self.count_subscribers(resolved)  # not an output of a node of this package
+        values = self.diagnostic_values.get(node, {})  # with those in the process of the node
+        return int(values.get(f"subscribers of {resolved}", 0))
 
     def _wait_until_delivered(self) -> None:
         from rclpy.duration import Duration
@@ -239,15 +242,19 @@ class BagPlayer(LidarNode):
 
     def _follow(self, cloud: bytes) -> None:
         """Wait until the graph keeps up; the time of the bag stands still meanwhile."""
-        if self.params.follow:
+        if self.follows:
             self._advance()
-            self.pace.wait_for_room(lambda: self.serve(timeout_sec=0.05), self.stop.done)
-            self.pace.add_cloud(cloud)
+            self.pace.wait_for_room(lambda: self.serve(timeout_sec=ANSWER_POLL_S),
+                                    self.stop.done)
             self.anchor = monotonic()
-            self._count_pace()
+        self.pace.add_cloud(cloud)
+        self._count_pace()
 
     def _count_pace(self) -> None:
-        if self.params.follow:
+        if latencies := sorted(self.pace.latencies_ms):
+            self.counts.update(latency_ms_median=f"{median(latencies):.1f}",
+                               latency_ms_p95=f"{latencies[int(0.95 * (len(latencies) - 1))]:.1f}")
+        if self.follows:
             played = max((self.now_ns - self.start_ns) / SECOND_NS / self.params.rate, 1e-9)
             self.counts.update(unanswered=self.pace.unanswered, held_s=f"{self.pace.held:.2f}",
                                slower=f"{(played + self.pace.held) / played:.2f}")

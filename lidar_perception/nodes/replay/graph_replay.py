@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from statistics import median
+from time import process_time
 from typing import Any
 
 from rich.text import Text
@@ -22,6 +23,7 @@ from lidar_perception.nodes.graph import (
     find_connected_outputs,
     list_awaited_topics,
     list_result_topics,
+    prefers_one_process,
     relative_name,
     reserve_domain,
 )
@@ -32,6 +34,7 @@ from lidar_perception.tracking.ego import choose_recorded_source
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
 
+GRAPH = "graph"  # process with the nodes of a graph
 TRACKS = f"/{TRACKER}/output/tracks"
 START_TIMEOUT_S = 180.0   # for all nodes to compile, start and find each other
 AHEAD = 2                 # clouds in flight, so that stages can work in parallel
@@ -39,7 +42,8 @@ SILENCE_TIMEOUT_S = 10.0  # without a result after the last cloud
 
 
 def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = "candidates",
-           rate: float = 1.0, single: bool = False, real_time: bool = False) -> dict:
+           rate: float = 1.0, single: bool = False, real_time: bool = False,
+           processes: bool | None = None) -> dict:
     """Replay a bag through the graph of a detector and record the results.
 
     The nodes run on a private ROS domain. Logs and the result bag are left in `out`.
@@ -54,12 +58,16 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         single: run the detector in one process.
         real_time: send clouds at the rate of the sensor. Otherwise a cloud is sent once the clouds
             before it have detections, so that none is lost on a slow machine.
+        processes: start one process for each node; False: one for all nodes of the graph; None: as
+            prefers_one_process() says.
 
     Returns:
-        clouds, results (number of frames), latency_ms (median and p95 from the arrival of a cloud
-        in this process to its detections), memory_mb (proportional set size), memory_mb_by_node,
-        slower (slowdown of the replay against `rate`), poses (their source for the tracker, see
-        choose_recorded_source), and for candidates the scores of the evaluator.
+        clouds, results (number of frames), latency_ms (median and p95 from sending a cloud to
+        receiving its detections in the player), memory_mb (proportional set size),
+        memory_mb_by_process, cpu_ms_by_process (CPU time per cloud), stage_ms (median time of each
+        node per cloud), one_process, slower (slowdown of the replay against `rate`), poses (their
+        source for the tracker, see recorded_source), and for candidates the scores of the
+        evaluator.
 
     Raises:
         InputError: the nodes do not connect, or there is no result.
@@ -84,57 +92,68 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         nodes["evaluator"] = configure_evaluator(scores.resolve(), single)
     recorded = [cloud_topic(single, detector), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
     nodes["bag_recorder"] = {}, {"bag": str((out / "result").resolve()), "topics": recorded}
-    with (Processes(out / "logs", domain) as processes,
+    one_process = prefers_one_process() if processes is None else not processes
+    with (Processes(out / "logs", domain) as running,
           GraphMonitor(domain, stages[FINAL]) as monitor):
-        for node, (remap, values) in nodes.items():
-            processes.start(node, remap, values)
+        with running.together(GRAPH) if one_process else nullcontext():
+            for node in graph:
+                running.start(node, *nodes[node])
+        for node in nodes.keys() - graph.keys():
+            running.start(node, *nodes[node])
         outputs = find_connected_outputs({node: remap for node, (remap, _) in nodes.items()})
         with errors.status("starting the nodes"):
             ready = monitor.spin_until(lambda: monitor.is_connected(outputs), START_TIMEOUT_S,
-                                       processes.check)
+                                       running.check)
         if not ready:
             raise InputError(f"the nodes did not find each other in {START_TIMEOUT_S:.0f} s: "
                              f"{list(monitor.diagnostics) or 'none'} reported; see {out}/logs")
-        # Besides the graph, the monitor subscribes to the clouds, and the tracker and the recorder
-        # may; the recorder also subscribes to the labels.
-        cloud_subscribers = 2 + (poses == "kiss_icp") + (POINTS in recorded)
+        # Besides the graph, the tracker and the recorder may subscribe to the clouds; the recorder
+        # also subscribes to the labels.
+        cloud_subscribers = 1 + (poses == "kiss_icp") + (POINTS in recorded)
         rules = list_awaited_topics(single, cloud_subscribers, 1 + 2 * scored, detector)
         # The detections have four subscribers: monitor, recorder, tracker, evaluator.
         rules += [f"{relative_name(stages[FINAL])}:={3 + scored}"]
         rules += [relative_name(ODOMETRY)] if poses == "recording" else []
-        processes.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
-                                           "wait_for": rules,
-                                           "follow": [] if real_time else [stages[FINAL]],
-                                           "ahead": AHEAD})
+        cpu: dict[str, float] = {}  # from the first result on
+        running.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
+                                         "wait_for": rules, "follow": [stages[FINAL]],
+                                         "ahead": 0 if real_time else AHEAD})
         with make_progress() as bar:
             task = bar.add_task("replaying", total=clouds)
             before = -1
 
             def finished() -> bool:
                 bar.update(task, completed=monitor.frames)
+                if monitor.frames and not cpu:
+                    cpu.update(running.cpu_seconds(), watch=process_time(), frames=monitor.frames)
                 return monitor.frames >= clouds
 
             while not finished() and (monitor.frames != before
-                                      or not processes.has_ended("bag_player")):
+                                      or not running.has_ended("bag_player")):
                 before = monitor.frames
                 monitor.spin_until(finished, SILENCE_TIMEOUT_S,
-                                   lambda: processes.check("bag_player"))
+                                   lambda: running.check("bag_player"))
         # Both lag behind the results by their own processing time.
         def caught_up(node: str) -> bool:
             return int(monitor.get_value(node, "frames") or 0) >= monitor.frames
 
         for node in {"evaluator", TRACKER} & nodes.keys():
             monitor.spin_until(partial(caught_up, node), SILENCE_TIMEOUT_S)
-        memory = processes.memory_mb()
-        codes = processes.stop(timeout=30)
+        stage_ms = {node: float(ms) for node in graph
+                    if (ms := monitor.get_value(node, "processing_ms_median"))}
+        memory = running.memory_mb()
+        timed = monitor.frames - cpu.pop("frames", 0)
+        cpu_ms = {name: 1e3 * (seconds - cpu.get(name, 0.0)) / max(timed, 1) for name, seconds in
+                  {**running.cpu_seconds(), "watch": process_time()}.items()}
+        codes = running.stop(timeout=30)
     if failed := {node: code for node, code in codes.items() if code}:
         errors.print(Text(f"exit codes {failed}", "red") + f"; see {out}/logs")
     if monitor.frames == 0:
         raise InputError(f"no cloud of {drive} gave a result; see {out}/logs")
-    latencies = sorted(monitor.latencies_ms) or [0.0]
     return {**(json.loads(scores.read_text()) if scored else {}),
             "clouds": clouds, "results": monitor.frames,
-            "latency_ms": {"median": median(latencies),
-                           "p95": latencies[int(0.95 * (len(latencies) - 1))]},
+            "latency_ms": {name: float(monitor.get_value("bag_player", f"latency_ms_{name}") or 0.0)
+                           for name in ("median", "p95")},
+            "cpu_ms_by_process": cpu_ms, "stage_ms": stage_ms, "one_process": one_process,
             "slower": float(monitor.get_value("bag_player", "slower") or 1.0),
-            "memory_mb": sum(memory.values()), "memory_mb_by_node": memory, "poses": poses}
+            "memory_mb": sum(memory.values()), "memory_mb_by_process": memory, "poses": poses}

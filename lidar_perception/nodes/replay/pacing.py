@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from time import monotonic
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from lidar_perception.nodes.runtime import MARKERS, RELIABLE
 from msg_utils.messages import load_message_class
 
+MAX_WAITING = 1000  # clouds without an answer, and timed answers
 SHORT_TIMEOUT_S = 1.0  # for a detection, after one has timed out
 
 
@@ -22,13 +24,19 @@ class Pace:
     Args:
         node: the node that subscribes to the topics.
         topics: topics of detections.
-        ahead: number of clouds that may be unanswered at a time.
+        ahead: number of clouds that may be unanswered at a time; 0: any number, so that no cloud
+            waits and the answers are only timed.
         timeout: seconds.
+
+    Attributes:
+        latencies_ms: times from sending a cloud to the last of its answers.
     """
 
     def __init__(self, node: Any, topics: Sequence[str], ahead: int, timeout: float):
         self.ahead, self.timeout, self.patience = ahead, timeout, timeout
         self.waiting: dict[bytes, set[str]] = {}  # stamp as in CDR -> missing topics; oldest first
+        self.sent: dict[bytes, float] = {}  # their monotonic times
+        self.latencies_ms: deque[float] = deque(maxlen=MAX_WAITING)
         self.unanswered, self.held = 0, 0.0
         self.topics = frozenset(topics)
         for topic in topics:
@@ -39,7 +47,10 @@ class Pace:
     def add_cloud(self, cloud: bytes) -> None:
         """Register a cloud, as CDR, that is sent now."""
         if self.topics:
-            self.waiting[bytes(cloud[4:12])] = set(self.topics)
+            stamp = bytes(cloud[4:12])
+            self.waiting[stamp], self.sent[stamp] = set(self.topics), monotonic()
+            if len(self.waiting) > MAX_WAITING:
+                self._give_up()
 
     def add_answer(self, stamp: bytes, topic: str) -> None:
         """Register detections on a topic; earlier clouds without any count as unanswered."""
@@ -53,15 +64,24 @@ class Pace:
             self.unanswered += missed
             if not left:
                 del self.waiting[earlier]
+                sent = self.sent.pop(earlier)
+                if earlier == stamp:
+                    self.latencies_ms.append((monotonic() - sent) * 1e3)
             if earlier == stamp:
                 return
+
+    def _give_up(self) -> None:
+        """Count the missing answers to the oldest cloud as unanswered."""
+        oldest = next(iter(self.waiting))
+        self.unanswered += len(self.waiting.pop(oldest))
+        del self.sent[oldest]
 
     def wait_for_room(self, serve: Callable[[], Any], is_stopped: Callable[[], bool]) -> None:
         """Call serve() until another cloud may be sent, or is_stopped()."""
         begin = monotonic()
-        while len(self.waiting) >= self.ahead and not is_stopped():
+        while self.ahead and len(self.waiting) >= self.ahead and not is_stopped():
             if monotonic() - begin > self.patience:
-                self.unanswered += len(self.waiting.pop(next(iter(self.waiting))))
+                self._give_up()
                 self.patience = min(self.patience, SHORT_TIMEOUT_S)
                 break
             serve()

@@ -1,0 +1,82 @@
+"""Counts of received, dropped and lost clouds, and their rate."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+DEPTH = 5
+WINDOW = 100            # sent clouds, for the shares of lost and dropped ones
+RATE_SAMPLES = 20       # intervals between clouds, whose median is the expected one
+RATE_INTERVALS = 10     # intervals, whose mean gives the present rate
+
+
+class Arrivals:
+    """Count received, dropped and lost clouds (sent = received + dropped + lost).
+
+    Publishers number their messages (publication_sequence_number). A gap counts as lost on the way
+    or, if the queue was full, as dropped from the queue.
+    """
+
+    def __init__(self, depth: int = DEPTH):
+        self.depth = depth
+        self.sent = self.dropped = self.lost = 0
+        self.sequence: int | None = None  # number of the last cloud
+        self.window: deque[tuple[int, int, int]] = deque([(0, 0, 0)], WINDOW + 1)
+        self.stamps: deque[tuple[int, int]] = deque(maxlen=RATE_SAMPLES + 1)  # sent, ns
+        self.learned: float | None = None  # expected rate, Hz
+
+    def add(self, infos: list[dict], dropped: int, one_publisher: bool = True) -> None:
+        """Count messages.
+
+        Args:
+            infos: message infos of rclpy, of all messages that were waiting, oldest first.
+            dropped: how many of them are not processed.
+            one_publisher: False with several publishers, whose numbers cannot be compared.
+        """
+        full = len(infos) >= self.depth
+        for i, info in enumerate(infos):
+            number, gap = info["publication_sequence_number"], 0
+            if one_publisher and number and self.sequence is not None and number > self.sequence:
+                gap = number - self.sequence - 1
+            self.sequence = (number or None) if one_publisher else None
+            if full and i == 0:
+                self.dropped += gap
+            else:
+                self.lost += gap
+            self.sent += 1 + gap
+            self.stamps.append((self.sent, info["source_timestamp"]))
+        self.dropped += dropped
+        self.window.append((self.sent, self.lost, self.dropped))
+        if self.learned is None and len(self.stamps) > RATE_SAMPLES:
+            intervals = np.diff(np.array(self.stamps, float), axis=0)
+            period = np.median(intervals[:, 1] / intervals[:, 0])
+            self.learned = 1e9 / period if period > 0 else None
+
+    def record_interruption(self, dropped: int) -> None:
+        """Count the waiting clouds as dropped, and ignore the clouds until the next one."""
+        self.dropped += dropped
+        self.sequence = None
+        self.stamps.clear()
+        self.reset_window()
+
+    def reset_window(self) -> None:
+        """Restart the window of count_recent(), because the cause of earlier drops is over."""
+        self.window.clear()
+        self.window.append((self.sent, self.lost, self.dropped))
+
+    def count_recent(self) -> tuple[int, int, int]:
+        """Return (sent, lost, dropped) of the last WINDOW sent clouds, or more after a long gap."""
+        now = self.window[-1]
+        before = next((w for w in reversed(self.window) if now[0] - w[0] >= WINDOW),
+                      self.window[0])
+        sent, lost, dropped = (a - b for a, b in zip(now, before))
+        return sent, lost, dropped
+
+    def measure_rate(self) -> float | None:
+        """Return the present rate of sent clouds in Hz, or None while too few have arrived."""
+        if len(self.stamps) <= RATE_INTERVALS:
+            return None
+        (n0, t0), (n1, t1) = self.stamps[-1 - RATE_INTERVALS], self.stamps[-1]
+        return 1e9 * (n1 - n0) / (t1 - t0) if t1 > t0 else None

@@ -1,0 +1,121 @@
+"""Links between the nodes of one process, which pass messages without serializing them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from time import time_ns
+from typing import Any
+
+from rclpy.qos import DurabilityPolicy
+
+from lidar_perception.wire.array_codec import encode_markers
+from lidar_perception.wire.codec import encode
+from msg_utils.markers import MarkerRows
+
+Receive = Callable[[Any, dict[str, int]], None]  # gets a message and its info, see Output
+
+
+class Output:
+    """A publisher that also passes its messages to the nodes of its process that are linked to it.
+
+    Messages are of rosbags' class, MarkerRows, or CDR. Linked nodes share them and must not change
+    them. They are serialized and published on DDS while somebody outside of the process subscribes,
+    and always in a process with one node.
+
+    Args:
+        publisher: of rclpy.
+        links: None in a process with one node.
+    """
+
+    def __init__(self, publisher: Any, links: Links | None):
+        self.publisher, self.links = publisher, links
+        self.receivers: tuple[Receive, ...] = ()
+        self.count = 0  # of messages for linked nodes
+        latched = publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        self.always_publishes = links is None or latched
+        if links is not None:
+            links.add(self)
+
+    @property
+    def topic_name(self) -> str:
+        name: str = self.publisher.topic_name
+        return name
+
+    def get_subscription_count(self) -> int:
+        """Return the number of subscribers, inside and outside of the process."""
+        return len(self.receivers) + int(self.publisher.get_subscription_count())
+
+    def publish(self, message: Any) -> None:
+        if receivers := self.receivers:
+            self.count += 1
+            info = {"publication_sequence_number": self.count, "source_timestamp": time_ns()}
+            for receive in receivers:
+                receive(message, info)
+        if self.always_publishes or self.publisher.get_subscription_count():
+            self.publisher.publish(_to_cdr(message))
+
+    def close(self) -> None:
+        """End the links of this publisher."""
+        if self.links is not None:
+            self.links.remove(self)
+
+
+def _to_cdr(message: Any) -> bytes:
+    if isinstance(message, bytes):
+        return message
+    if isinstance(message, MarkerRows):
+        return encode_markers(message.rows, message.header, message.lifetime_ns)
+    return encode(message)
+
+
+class Links:
+    """The outputs of the nodes of one process, and the inputs that may be linked to them."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._outputs: dict[str, tuple[Output, ...]] = {}
+        self._waiting: dict[str, tuple[Callable[[], None], ...]] = {}  # called at a change
+
+    def add(self, output: Output) -> None:
+        """Add an output and tell the inputs of its topic."""
+        topic = output.topic_name
+        with self._lock:
+            self._outputs[topic] = (*self._outputs.get(topic, ()), output)
+        self._notify(topic)
+
+    def remove(self, output: Output) -> None:
+        """Remove an output and tell the inputs of its topic."""
+        topic = output.topic_name
+        with self._lock:
+            self._outputs[topic] = tuple(o for o in self._outputs.get(topic, ()) if o is not output)
+            output.receivers = ()
+        self._notify(topic)
+
+    def _notify(self, topic: str) -> None:
+        for on_change in self._waiting.get(topic, ()):
+            on_change()
+
+    def watch(self, topic: str, on_change: Callable[[], None]) -> None:
+        """Call on_change(), in any thread, when an output of the topic comes or goes."""
+        with self._lock:
+            self._waiting[topic] = (*self._waiting.get(topic, ()), on_change)
+
+    def unwatch(self, topic: str, on_change: Callable[[], None]) -> None:
+        """End watch()."""
+        with self._lock:
+            self._waiting[topic] = tuple(c for c in self._waiting.get(topic, ()) if c != on_change)
+
+    def find_output(self, topic: str) -> Output | None:
+        """Return the output of a topic if there is exactly one in this process, else None."""
+        outputs = self._outputs.get(topic, ())
+        return outputs[0] if len(outputs) == 1 else None
+
+    def connect(self, output: Output, receive: Receive) -> None:
+        """Pass the messages of an output to receive(), in the thread of the publisher."""
+        with self._lock:
+            output.receivers = (*output.receivers, receive)
+
+    def disconnect(self, output: Output, receive: Receive) -> None:
+        with self._lock:
+            output.receivers = tuple(r for r in output.receivers if r != receive)

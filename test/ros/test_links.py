@@ -1,0 +1,172 @@
+"""Links between the nodes of one process."""
+
+from __future__ import annotations
+
+from signal import SIGINT
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+
+from lidar_perception.nodes.clustering import Clustering
+from lidar_perception.nodes.external_node import create_context, shut_down_context
+from lidar_perception.nodes.graph import build_graph
+from lidar_perception.nodes.ground_segmentation import GroundSegmentation
+from lidar_perception.nodes.links import Links, Output
+from lidar_perception.nodes.runtime import LATCHED, RELIABLE
+from lidar_perception.testing.clouds import make_cloud_message
+from lidar_perception.types import Detections
+from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.messages import make_detection_rows
+from msg_utils.markers import MarkerRows, from_marker_array
+from msg_utils.messages import load_message_class
+from msg_utils.stamps import make_header
+
+CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
+GROUND_POINTS = "/ground_segmentation/output/points"
+CLUSTERING_INPUT = ["--ros-args", "-r", f"~/input/points:={GROUND_POINTS}"]
+
+
+def make_cloud(stamp_ns=10**18):
+    points = np.random.default_rng(0).uniform(-20, 20, (2000, 4)) * [1, 1, 0.01, 0.02]
+    return make_cloud_message(points - [0, 0, 1.7, -0.5], stamp_ns)
+
+
+@pytest.fixture
+def graph(domain):
+    """Ground segmentation and clustering, linked, and a function that spins both."""
+    context, links = create_context(domain), Links()
+    ground = GroundSegmentation(context=context, links=links)
+    clustering = Clustering(context=context, links=links, cli_args=CLUSTERING_INPUT)
+    executor = SingleThreadedExecutor(context=context)
+    for node in (ground, clustering):
+        node.start()
+        executor.add_node(node)
+
+    def spin(times=20):
+        for _ in range(times):
+            executor.spin_once(timeout_sec=0.01)
+
+    yield SimpleNamespace(ground=ground, clustering=clustering, spin=spin, context=context,
+                          reception=clustering._receptions()[0])
+    executor.shutdown()
+    shut_down_context(context, ground, clustering)
+
+
+def test_linked_nodes_pass_messages_without_dds(graph, monkeypatch):
+    assert graph.reception.subscription is None
+    assert graph.ground.points.get_subscription_count() == 1
+    sent, received = [], []
+    monkeypatch.setattr(graph.ground.points.publisher, "publish", sent.append)
+    monkeypatch.setattr(graph.reception, "deliver", lambda msg, _: received.append(msg))
+    graph.ground.on_points(cloud := make_cloud())
+    graph.spin()
+    message, = received
+    assert message.header is cloud.header and not sent
+    graph.ground.create_subscription(load_message_class(CLOUD), GROUND_POINTS, lambda _: None,
+                                     RELIABLE)
+    graph.spin()
+    graph.ground.on_points(cloud)
+    assert sent == [encode(message)]
+    assert graph.reception.values() == {"lost": 0, "dropped": 0, "reliability": "in this process"}
+
+
+def test_newest_linked_message_wins_and_others_count_as_dropped(graph, monkeypatch):
+    received = []
+    monkeypatch.setattr(graph.reception, "deliver", lambda msg, _: received.append(msg))
+    graph.ground.on_points(make_cloud(10**18))
+    graph.spin()
+    for i in range(1, 10):
+        graph.ground.on_points(make_cloud(10**18 + i))
+    graph.spin()
+    assert [m.header.stamp.nanosec for m in received] == [0, 9]
+    assert graph.reception.arrivals.sent == 10 and graph.reception.arrivals.dropped == 8
+
+
+def test_second_publisher_ends_the_link(graph, monkeypatch):
+    other = graph.clustering.create_publisher(
+        load_message_class(CLOUD), GROUND_POINTS, RELIABLE)
+    graph.reception.adapt()
+    assert graph.reception.subscription is not None and not graph.ground.points.receivers
+    assert any("2 publishers" in text for _, _, text in graph.reception.problems())
+    graph.clustering.destroy_publisher(other)
+    graph.reception.adapt()
+    assert graph.reception.subscription is None and graph.ground.points.receivers
+
+
+def test_link_ends_with_the_nodes_that_made_it(graph):
+    assert graph.ground.points.receivers
+    graph.clustering.trigger_deactivate()
+    assert not graph.ground.points.receivers
+    graph.clustering.trigger_activate()
+    graph.ground.trigger_deactivate()
+    graph.ground.trigger_cleanup()
+    graph.spin()
+    assert graph.reception.output is None and graph.reception.subscription is not None
+    graph.ground.trigger_configure()
+    graph.spin()
+    assert graph.reception.output is graph.ground.points
+
+
+def test_tracker_reads_the_same_objects_from_rows_and_from_cdr():
+    rng = np.random.default_rng(0)
+    found = Detections.of(rng.normal(0, 5, (20, 7)) ** 2, rng.integers(0, 3, 20),
+                          rng.random(20))
+    header = make_header(10**18 + 5, "velodyne", bag_message)
+    for detections in (found, Detections.none()):
+        rows = MarkerRows(make_detection_rows(detections, {("Car", 99)}), header)
+        sent: list[bytes] = []
+        Output(SimpleNamespace(qos_profile=QoSProfile(depth=1), topic_name="/a",
+                               publish=sent.append), None).publish(rows)
+        direct, decoded = from_marker_array(rows), from_marker_array(decode(sent[0], MARKERS))
+        for name in ("boxes", "scores", "ids"):
+            np.testing.assert_array_equal(getattr(direct, name), getattr(decoded, name))
+        for name in ("labels", "extras", "notes", "stamp_ns", "frame_id"):
+            assert getattr(direct, name) == getattr(decoded, name)
+
+
+def test_latched_messages_are_always_published():
+    sent: list[bytes] = []
+    for qos, expected in ((LATCHED, [b"1"]), (RELIABLE, [])):
+        sent.clear()
+        Output(SimpleNamespace(qos_profile=qos, topic_name="/a", publish=sent.append,
+                               get_subscription_count=lambda: 0), Links()).publish(b"1")
+        assert sent == expected
+
+
+NODES = ("ground_segmentation", "clustering", "tracker")
+
+
+def start_together(processes, **params):
+    with processes.together("graph"):
+        for node in NODES:
+            processes.start(node, build_graph(["pointnet"], tracking=True)[node],
+                            params.get(node, {}))
+
+
+def test_nodes_of_one_process_have_their_own_parameters_and_end_at_a_signal(processes, peer):
+    start_together(processes, clustering={"input.queu": 5},
+                   tracker={"autostart": False})
+    peer.wait(lambda: set(NODES) <= set(peer.diagnostics), "all nodes")
+    assert peer.get_message("tracker") == "not configured"
+    assert peer.get_value("ground_segmentation", f"subscribers of {GROUND_POINTS}") == "1"
+    assert peer.set_parameters("/clustering", {"clustering.dbscan.min_samples": 7}) == []
+    processes.running["graph"].send_signal(SIGINT)
+    peer.spin_until(lambda: processes.has_ended("graph"), 15.0)
+    assert processes.running["graph"].returncode == 0
+    log = processes.read_log("graph")
+    assert "Traceback" not in log
+    warned, = [line for line in log.splitlines() if "'input.queu'" in line]
+    assert "[clustering]" in warned and "is 'input.queue' meant" in warned
+
+
+def test_bad_parameter_of_one_node_ends_the_process_with_code_2(processes):
+    start_together(processes, clustering={"clustering.method": "magic"})
+    assert processes.running["graph"].wait(timeout=60) == 2
+    last = processes.read_log("graph").splitlines()[-1]
+    assert "[clustering]" in last and "method = 'magic' must be one of" in last
