@@ -1,7 +1,8 @@
 """Scale of intensities: drivers write 0..1, percent, 8, 10, 12 or 16 bits; the core uses 0..1.
 
 Every source uses `infer_full_scale`, which infers a scale that is not declared, and `to_unit`,
-which applies it. See docs/reference/recordings.md#intensity.
+which applies it. See docs/reference/recordings.md#intensity. Networks read the result of
+`normalize_intensity`.
 """
 
 from __future__ import annotations
@@ -17,6 +18,13 @@ MAX_OUTLIERS = 1e-4    # share of the values of a cloud that may exceed its scal
 WHOLE_SAMPLE = 10_000  # number of values that are checked for being whole numbers
 MIN_BRIGHT = 0.05      # a cloud of MIN_POINTS points with lower values only has another scale
 MIN_POINTS = 1000
+MIN_KNOWN = 0.1        # share of the points that must have an intensity for it to be usable
+# Distribution of positive intensities that networks read: shares, and the values that these shares
+# do not exceed; as of an HDL-64E in towns.
+REFERENCE_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98,
+                    0.99, 0.995, 1.0)
+REFERENCE_VALUES = (0.01, 0.05, 0.09, 0.135, 0.185, 0.225, 0.26, 0.285, 0.31, 0.335, 0.37, 0.42,
+                    0.48, 0.55, 0.62, 0.71, 0.99)
 INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # a cloud's first one counts
 
 
@@ -68,6 +76,36 @@ def to_unit(values: np.ndarray, full: float) -> np.ndarray:
     return values / np.float32(full)
 
 
+def normalize_intensity(intensity: np.ndarray | None) -> np.ndarray | None:
+    """Map the intensities of a cloud to the distribution that networks are trained with.
+
+    The result depends on the order of the intensities only, so that gain, gamma and scale of the
+    sensor have no effect. Zeros stay zeros, as sensors report them for the weakest returns.
+
+    Args:
+        intensity: (N,) intensities, NaN for unknown ones, or None.
+
+    Returns:
+        (N,) float32; None if there is no usable intensity: none at all, fewer than MIN_KNOWN of
+        them positive, or nearly all positive ones equal.
+    """
+    if intensity is None:
+        return None
+    positive = intensity > 0
+    values = intensity[positive]
+    if len(values) <= MIN_KNOWN * len(intensity):
+        return None
+    knots = np.quantile(values, REFERENCE_SHARES)
+    if knots[REFERENCE_SHARES.index(0.1)] >= knots[REFERENCE_SHARES.index(0.9)]:
+        return None
+    # Of equal knots, the middle one counts: np.interp needs them to rise.
+    unique, inverse = np.unique(knots, return_inverse=True)
+    middles = np.bincount(inverse, REFERENCE_VALUES) / np.bincount(inverse)
+    normalized = np.where(np.isnan(intensity), intensity, np.float32(0)).astype(np.float32)
+    normalized[positive] = np.interp(values, unique, middles)
+    return normalized
+
+
 class StreamScale:
     """Scale of a stream of clouds: the largest that infer_full_scale() found for any of them.
 
@@ -83,16 +121,15 @@ class StreamScale:
         return self.full
 
 
-def find_scale_problem(intensity: np.ndarray | None, factor: float = 1.0) -> str | None:
+def find_scale_problem(intensity: np.ndarray | None) -> str | None:
     """Describe a wrong scale of intensities (N,) that should be 0..1, with the remedy.
 
-    None if the scale is right or there is no intensity. factor is a parameter by which the reader
-    multiplies intensities, such as `fused.intensity_scale`.
+    None if the scale is right or there is no intensity.
     """
-    if intensity is None or factor == 0.0:
+    if intensity is None:
         return None
-    greatest = float(np.fmax.reduce(intensity, initial=0)) * factor
-    inferred = guess_scale(intensity, factor)
+    greatest = float(np.fmax.reduce(intensity, initial=0))
+    inferred = guess_scale(intensity)
     if inferred == 1.0 and (greatest == 0.0 or greatest >= MIN_BRIGHT
                             or len(intensity) < MIN_POINTS):
         return None
@@ -102,11 +139,6 @@ def find_scale_problem(intensity: np.ndarray | None, factor: float = 1.0) -> str
             "full reflection (1, 100 or 255 for most drivers; setup measures it)")
 
 
-def guess_scale(intensity: np.ndarray, factor: float = 1.0) -> float:
-    """Return infer_full_scale() of intensities (N,) that should be 0..1.
-
-    1 if they are in 0..1 with or without multiplication by factor.
-    """
-    if not _exceeds(intensity, MAX_UNIT) or not _exceeds(intensity, MAX_UNIT / max(factor, 1e-9)):
-        return 1.0
-    return infer_full_scale(intensity)
+def guess_scale(intensity: np.ndarray) -> float:
+    """Return infer_full_scale() of intensities (N,) that should be 0..1."""
+    return infer_full_scale(intensity) if _exceeds(intensity, MAX_UNIT) else 1.0

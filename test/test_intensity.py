@@ -12,10 +12,13 @@ from lidar_perception.clustering.cluster import cluster, cluster_obstacles
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.intensity import (
+    REFERENCE_SHARES,
+    REFERENCE_VALUES,
     StreamScale,
     find_scale_problem,
     guess_scale,
     infer_full_scale,
+    normalize_intensity,
     to_unit,
 )
 from lidar_perception.nodes.sensor_check import SensorCheck
@@ -98,17 +101,34 @@ def test_a_wrong_scale_is_reported_with_the_remedy(full):
     problem = find_scale_problem(values)
     assert "input.intensity_max" in problem and f"divided by {full}, a guess" in problem
     assert "PointCloud.of" in problem and "\n" not in problem
-    for factor in (0.0, 1 / full):  # fused.intensity_scale ignores or corrects the intensity
-        assert find_scale_problem(values, factor) is None and guess_scale(values, factor) == 1.0
-    assert guess_scale(values, 0.4) == full
 
 
 def test_dark_intensities_are_reported():
     assert "goes up to 0.02 " in find_scale_problem(UNIT * np.float32(0.02))
     assert find_scale_problem(UNIT[:100] * np.float32(0.02)) is None
-    assert find_scale_problem(UNIT * np.float32(0.02), 40.0) is None
     for fine in (None, UNIT, UNIT * 0, UNIT[:0], np.full(3000, 0.3)):
         assert find_scale_problem(fine) is None
+
+
+@pytest.mark.parametrize("change", [lambda x: 0.1 * x, lambda x: 255 * x, lambda x: x ** 2.2,
+                                    lambda x: np.round(x * 255)])
+def test_normalized_intensity_ignores_gain_and_gamma(change):
+    rng = np.random.default_rng(2)
+    intensity = rng.beta(2, 5, 20_000).astype(np.float32)
+    intensity[::10] = 0
+    normalized = normalize_intensity(intensity)
+    np.testing.assert_allclose(normalize_intensity(change(intensity)), normalized, atol=0.02)
+    assert (normalized[::10] == 0).all() and normalized.dtype == np.float32
+    positive = normalized[normalized > 0]
+    np.testing.assert_allclose(np.quantile(positive, REFERENCE_SHARES), REFERENCE_VALUES,
+                               atol=0.02)
+
+
+def test_an_unusable_intensity_normalizes_to_none():
+    few = np.where(np.arange(1000) % 20, 0, 0.5)
+    same = np.where(np.arange(1000) % 20, 0.5, 0.7)
+    for intensity in (None, few, same, np.zeros(9), np.zeros(0), np.full(9, np.nan)):
+        assert normalize_intensity(intensity) is None
 
 
 # arrays

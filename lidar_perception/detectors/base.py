@@ -42,7 +42,7 @@ class NetworkDetector:
             InputError: also if CUDA is out of memory and the parameter cpu_fallback is off.
         """
         frame, ground, cluster_ids, problem = accept(cloud, ground, cluster_ids,
-                                                     self.settings.intensity_scale)
+                                                     self.settings.use_intensity)
         if self.params.crop.enabled:
             kept, frame = crop_with_sensor_pose(frame, self.params.crop,
                                                 self.params.ground.sensor_pose)

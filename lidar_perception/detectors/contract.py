@@ -91,14 +91,14 @@ class Accepted(NamedTuple):
 
 
 def accept(cloud: Cloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None,
-           intensity_scale: float = 1.0) -> Accepted:
+           use_intensity: bool = True) -> Accepted:
     """Check and convert the arguments of a detector, see Detector.__call__.
 
     An intensity outside 0..1 is divided by the scale that it seems to have. This is a guess from
     one cloud, so it is also reported as a problem.
 
     Args:
-        intensity_scale: factor by which the detector multiplies the intensity; 0: it reads none.
+        use_intensity: False: the detector leaves the intensity out.
     """
     frame = as_point_cloud(cloud)
     check_columns(len(frame), ground=ground, cluster_ids=cluster_ids)
@@ -109,9 +109,9 @@ def accept(cloud: Cloud, ground: np.ndarray | None, cluster_ids: np.ndarray | No
         frame = frame.take(kept)
         ground, cluster_ids = (column if column is None else column.take(kept)
                                for column in (ground, cluster_ids))
-    problem = find_scale_problem(frame.intensity, intensity_scale)
+    problem = find_scale_problem(frame.intensity) if use_intensity else None
     if problem and frame.intensity is not None:
-        full = guess_scale(frame.intensity, intensity_scale)
+        full = guess_scale(frame.intensity)
         if full != 1.0:
             frame = replace(frame, intensity=to_unit(frame.intensity, full))
     return Accepted(frame, ground, cluster_ids, problem)

@@ -10,7 +10,7 @@ from lidar_perception.classes import CAR
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.ground.params import GroundParams, SensorPoseParams
 from lidar_perception.ground.segment import level_points, segment_ground
-from lidar_perception.intensity import MIN_POINTS
+from lidar_perception.intensity import MIN_POINTS, normalize_intensity
 from lidar_perception.types import SENSOR_HEIGHT, Detections, PointCloud
 
 MAX_MAST_M = 1.0     # a car farther below the sensor passes under a gantry
@@ -24,31 +24,31 @@ class NormalizedView:
     """A cloud as a level sensor SENSOR_HEIGHT above the ground would have measured it.
 
     Attributes:
-        frame: the M points in the view, with scaled intensity.
+        frame: the M points in the view, with the intensity of normalize_intensity(), None if the
+            cloud has no usable one.
         indices: (M,) int64 of these points in `source`.
         source: the cloud in the sensor's own coordinates, N points.
         pose: mounting of the sensor of `source`.
-        intensity_scale: factor of the intensity; 0: the view has none.
+        use_intensity: False: the view leaves the intensity out.
     """
 
     frame: PointCloud
     indices: np.ndarray
     source: PointCloud
     pose: SensorPoseParams
-    intensity_scale: float
+    use_intensity: bool
 
     @staticmethod
     def of(source: PointCloud, pose: SensorPoseParams = SensorPoseParams(),
            low: Corner | None = None, high: Corner | None = None,
-           intensity_scale: float = 1.0) -> NormalizedView:
+           use_intensity: bool = True) -> NormalizedView:
         """Return the view of a cloud.
 
         Args:
             low, high: range of the view, low <= x y z < high; points outside and points that are
                 not finite are left out. None: all points are kept.
-            intensity_scale: factor of the intensity. With 0 the view has no intensity: zeros would
-                still be read, for example by Patchwork++, which removes dark points below the
-                ground as reflections.
+            use_intensity: False leaves the intensity out. Zeros would still be read, for example
+                by Patchwork++, which removes dark points below the ground as reflections.
         """
         shift = np.array([0, 0, pose.height - SENSOR_HEIGHT], np.float32)
         xyz, indices, frame = level_points(source.xyz, pose), np.arange(len(source)), source
@@ -56,9 +56,11 @@ class NormalizedView:
             indices = _indices_in_range(xyz, np.array(low, np.float32) - shift,
                                         np.array(high, np.float32) - shift)
             frame, xyz = source.take(indices), xyz.take(indices, axis=0)
-        frame = replace(frame, xyz=xyz + shift,
-                        intensity=_scale_intensity(frame.intensity, intensity_scale))
-        return NormalizedView(frame, indices, source, pose, intensity_scale)
+        intensity = normalize_intensity(source.intensity) if use_intensity else None
+        if intensity is not None and len(intensity) != len(indices):
+            intensity = intensity.take(indices)
+        frame = replace(frame, xyz=xyz + shift, intensity=intensity)
+        return NormalizedView(frame, indices, source, pose, use_intensity)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -68,14 +70,17 @@ class NormalizedView:
         return None if column is None else column.take(self.indices)
 
     def intensity_problem(self) -> str | None:
-        """Return the problem if the cloud has no intensity that a network could read; None if it
-        has, or the view leaves the intensity out."""
+        """Return the problem if the cloud has no usable intensity; None if it has, or the view
+        leaves the intensity out."""
         intensity = self.source.intensity
-        if not self.intensity_scale or (intensity is not None and (
-                len(intensity) < MIN_POINTS or intensity.any())):
+        if not self.use_intensity or self.frame.intensity is not None or (
+                intensity is not None and len(intensity) < MIN_POINTS):
             return None
-        lack = "has no intensity" if intensity is None else "has the intensity 0 everywhere"
-        return f"the cloud {lack}, which the network was trained with; it reads zeros"
+        lack = ("has no intensity" if intensity is None else
+                "has the intensity 0 everywhere" if not intensity.any() else
+                "has the same intensity nearly everywhere")
+        return (f"the cloud {lack}, without which fewer people are found; use_intensity false if "
+                "the sensor has none")
 
 
 def _indices_in_range(xyz: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -84,10 +89,6 @@ def _indices_in_range(xyz: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.
         for axis in range(3):
             inside &= (xyz[:, axis] >= low[axis]) & (xyz[:, axis] < high[axis])
     return np.flatnonzero(inside)
-
-
-def _scale_intensity(intensity: np.ndarray | None, scale: float) -> np.ndarray | None:
-    return None if intensity is None or not scale else intensity * np.float32(scale)
 
 
 def crop_to_range(frame: PointCloud, low: Corner, high: Corner) -> tuple[np.ndarray, PointCloud]:

@@ -105,8 +105,7 @@ class NetworkParams(Params):
     cpu_fallback: bool = param(True, "Fall back to the CPU when CUDA runs out of memory; in a "
                                      "node also when there is no CUDA device.")
     warm_up: bool = param(True, "Run once on synthetic points before the first cloud.", fixed=True)
-    intensity_scale: float = param(1.0, "Factor of the intensity (0..1), for a sensor that reports "
-                                   "higher or lower values than the one in training; 0: ignore "
-                                   "the intensity.", low=0.0, high=1000.0)
+    use_intensity: bool = param(True, "Use the intensity. It is normalized, so that gain and scale "
+                                      "of the sensor have no effect. false: leave it out.")
     scores: ScoreParams = ScoreParams()
     nms: NmsParams = NmsParams()

@@ -12,12 +12,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidar_perception.geometry import bev_iou, elevation_angles, is_within, to_box_frame, wrap_angle
-from lidar_perception.training.params import AugmentParams, NoiseParams, ThingParams
+from lidar_perception.training.params import (
+    AugmentParams,
+    IntensityParams,
+    NoiseParams,
+    ThingParams,
+)
 from lidar_perception.training.pasting import MIN_RANGE_M, find_points_in_box
 from lidar_perception.types import SENSOR_HEIGHT
 
 BEAM_STEP = np.radians(0.4)  # elevation between two beams
 REFLECTOR_INTENSITY = 0.99
+FADE_RANGE_M = 15.0  # range at which a fading intensity does not change
 BOX_MARGIN_M = 0.01  # points this near to a box belong to it, since labels are rounded
 
 
@@ -53,6 +59,7 @@ def augment_scene(scene: TrainingScene, params: AugmentParams,
     scene = drop_points(scene, rng.uniform(0, params.dropout), rng)
     scene = change_intensity(scene, 1 + rng.uniform(-params.intensity, params.intensity),
                              rng.uniform(-params.intensity, params.intensity) / 2)
+    scene = replace(scene, points=distort_intensity(scene.points, params, rng))
     return raise_scene(scene, rng.uniform(-params.height, params.height),
                        rng.uniform(-params.tilt, params.tilt, 2))
 
@@ -120,6 +127,30 @@ def change_intensity(scene: TrainingScene, factor: float, offset: float) -> Trai
     positive = points[:, 3] > 0
     points[positive, 3] = np.clip(points[positive, 3] * factor + offset, 0, 1)
     return replace(scene, points=points)
+
+
+def distort_intensity(points: np.ndarray, params: IntensityParams,
+                      rng: np.random.Generator) -> np.ndarray:
+    """Change or remove the intensities of points (N, 4), as other sensors report them.
+
+    Removed intensities are 0, and an intensity of 0 stays 0. Gain and gamma need no change, since
+    they have no effect on what networks read, see normalize_intensity.
+    """
+    points = points.copy()
+    if rng.random() < params.no_intensity:
+        points[:, 3] = 0
+        return points
+    exponent = rng.uniform(-params.fade, params.fade)
+    speckle = rng.uniform(0, params.speckle)
+    levels = np.exp(rng.uniform(np.log(max(params.quantize, 1)), np.log(255)))
+    positive = np.flatnonzero(points[:, 3] > 0)
+    ranges = np.linalg.norm(points[positive, :3], axis=1) / FADE_RANGE_M
+    intensity = points[positive, 3] * np.maximum(ranges, 0.1) ** exponent
+    intensity += rng.normal(0, speckle, len(positive))
+    if params.quantize:
+        intensity = np.round(intensity * levels) / levels
+    points[positive, 3] = np.maximum(intensity, 0)
+    return points
 
 
 def add_reflector(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -72,6 +72,20 @@ class NoiseParams(Params):
 
 
 @dataclass(frozen=True)
+class IntensityParams(Params):
+    """Changes of the intensity of whole scans, before it is normalized."""
+
+    no_intensity: float = param(0.5, "Probability that a scene has no intensity.", low=0.0,
+                                high=1.0)
+    fade: float = param(0.5, "Intensities are multiplied by a power of the range, whose exponent "
+                             "is up to plus or minus this.", low=0.0, high=2.0)
+    quantize: int = param(16, "Intensities are rounded to this many levels or more, up to 255. "
+                              "0: not at all.", low=0, high=255)
+    speckle: float = param(0.05, "Error of each intensity; largest standard deviation.", low=0.0,
+                           high=1.0)
+
+
+@dataclass(frozen=True)
 class ThingParams(NoiseParams):
     """Changes of background that resembles objects."""
 
@@ -84,7 +98,7 @@ class ThingParams(NoiseParams):
 
 
 @dataclass(frozen=True)
-class AugmentParams(ThingParams):
+class AugmentParams(ThingParams, IntensityParams):
     """Changes of scenes. 0 switches a change off."""
 
     crowded: float = param(0.7, "Probability that objects from other scenes are pasted into a "
@@ -178,7 +192,7 @@ class PointPillarsTraining(SceneTraining):
 
 
 @dataclass(frozen=True)
-class ClusterAugmentParams(ThingParams):
+class ClusterAugmentParams(ThingParams, IntensityParams):
     """Clusters to train on, and their changes. 0 switches a change off.
 
     The background clusters are the things of ThingParams.

@@ -159,18 +159,17 @@ def test_a_tilted_sensor_finds_the_same_boxes_in_its_own_frame(roll, pitch):
     assert same(to_sensor_frame(found, SensorPoseParams()), found)
 
 
-def test_intensity_is_scaled_and_may_be_left_out():
+def test_intensity_is_normalized_and_may_be_left_out():
     detector, scan = random_detector(), frame()
     found = detector(scan)
-    half = replace(scan, intensity=scan.intensity / 2)
-    assert not same(detector(half), found)
-    detector.params = with_values(detector.params, {"pointpillars.intensity_scale": 2.0})
-    assert same(detector(half), found)
+    assert same(detector(replace(scan, intensity=scan.intensity / 2)), found)
+    other = replace(scan, intensity=scan.intensity[::-1].copy())
+    assert not same(detector(other), found)
     without = detector(replace(scan, intensity=None))
     assert "no intensity" in without.problem
     half = np.where(np.arange(len(scan)) % 2, np.float32(np.nan), scan.intensity)
     assert "their intensity is NaN" in detector(replace(scan, intensity=half)).problem
-    detector.params = with_values(detector.params, {"pointpillars.intensity_scale": 0.0})
+    detector.params = with_values(detector.params, {"pointpillars.use_intensity": False})
     for blind in scan, replace(scan, intensity=None), replace(scan, intensity=half):
         assert same(detector(blind), without) and detector(blind).problem is None
 

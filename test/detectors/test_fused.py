@@ -229,7 +229,7 @@ def test_a_higher_sensor_and_given_columns_change_nothing(detector):
 def test_an_intensity_that_is_left_out_is_as_one_that_is_not_there(detector):
     """For the ground, too, which else loses what is low and dark as reflections."""
     scan, other = frame(), copy.copy(detector)
-    other.params = with_values(detector.params, {"fused.intensity_scale": 0.0})
+    other.params = with_values(detector.params, {"fused.use_intensity": False})
     pit = np.random.default_rng(0).uniform([4, -4, -2.81], [9, 4, -2.79], (3000, 3))
     scan = PointCloud(np.concatenate([scan.xyz, pit.astype(np.float32)]),
                       np.concatenate([scan.intensity, np.full(3000, 0.5, np.float32)]))

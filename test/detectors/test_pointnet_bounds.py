@@ -45,7 +45,7 @@ def test_of_too_many_clusters_the_nearest_are_looked_at_and_the_others_counted()
 
     def detected(params, chosen=None):
         wanted = ids if chosen is None else np.where(chosen, ids, 0)
-        return random_detector(with_values(params, {"pointnet.intensity_scale": 0.0}))(
+        return random_detector(with_values(params, {"pointnet.use_intensity": False}))(
             frame, ground=ground, cluster_ids=wanted)
     few = with_values(eager(), {"pointnet.max_clusters": 40})
     capped, everything = detected(few), detected(eager())

@@ -208,7 +208,8 @@ def test_where_nothing_passes_the_best_scores_are_said(ids):
 @pytest.mark.parametrize("layer", ["classes", "box"])
 def test_what_is_not_a_number_is_left_out_and_said(layer, ids):
     detector, scan = random_detector(), frame()
-    expected = detector(scan, cluster_ids=np.where(ids == 2, 0, ids)).detections
+    dark = replace(scan, intensity=np.where(ids == 2, np.float32(0), scan.intensity))
+    expected = detector(dark, cluster_ids=np.where(ids == 2, 0, ids)).detections
     intensity = np.where(ids == 2, np.float32(np.nan), scan.intensity)
     found = detector(replace(scan, intensity=intensity), cluster_ids=ids)
     assert same(found, expected)
@@ -221,16 +222,16 @@ def test_what_is_not_a_number_is_left_out_and_said(layer, ids):
     assert len(found.detections) == 0 and "NaN" in found.problem
 
 
-def test_intensity_is_scaled_and_may_be_left_out(ids):
+def test_intensity_is_normalized_and_may_be_left_out(ids):
     detector, scan = random_detector(), frame()
     found = detector(scan, cluster_ids=ids).detections
     half = replace(scan, intensity=scan.intensity / 2)
-    assert not same(detector(half, cluster_ids=ids), found)
-    detector.params = with_values(eager(), {"pointnet.intensity_scale": 2.0})
     assert same(detector(half, cluster_ids=ids), found)
+    other = replace(scan, intensity=scan.intensity[::-1].copy())
+    assert not same(detector(other, cluster_ids=ids), found)
     without = detector(replace(scan, intensity=None), cluster_ids=ids)
     assert "no intensity" in without.problem
-    detector.params = with_values(eager(), {"pointnet.intensity_scale": 0.0})
+    detector.params = with_values(eager(), {"pointnet.use_intensity": False})
     unknown = np.full_like(scan.intensity, np.nan)
     for blind in scan, replace(scan, intensity=None), replace(scan, intensity=unknown):
         found = detector(blind, cluster_ids=ids)

@@ -17,6 +17,7 @@ from lidar_perception.training.augment import (
     blur_ranges,
     change_intensity,
     crop_scene,
+    distort_intensity,
     drop_points,
     flip_scene,
     move_objects,
@@ -36,6 +37,7 @@ seeds = st.integers(0, 2**32 - 1)
 CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
 STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,
                       flip=0, turn=0, scale=0, beam_noise=0, range_noise=0, dropout=0, intensity=0,
+                      no_intensity=0, fade=0, quantize=0, speckle=0,
                       height=0, tilt=0)
 
 
@@ -149,6 +151,21 @@ def test_intensity_stays_within_0_and_1_and_0_stays_0(seed):
     assert np.array_equal(changed.points[:, :3], scene.points[:, :3])
     scene.points[::2, 3] = 0  # returns too weak to have an intensity
     assert (change_intensity(scene, 1.4, 0.2).points[::2, 3] == 0).all()
+
+
+def test_intensity_of_whole_scans_is_removed_or_distorted():
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(2, 60, (4000, 3)), rng.uniform(0.1, 0.4, 4000)])
+    points[::4, 3] = 0
+    removed = distort_intensity(points, replace(STILL, no_intensity=1), rng)
+    assert not removed[:, 3].any() and np.array_equal(removed[:, :3], points[:, :3])
+    faded = distort_intensity(points, replace(STILL, fade=1.0), np.random.default_rng(3))
+    ratio = faded[:, 3][points[:, 3] > 0] / points[:, 3][points[:, 3] > 0]
+    ranges = np.linalg.norm(points[points[:, 3] > 0, :3], axis=1)
+    assert abs(np.corrcoef(np.log(ratio), np.log(ranges))[0, 1]) > 0.999
+    rounded = distort_intensity(points, replace(STILL, quantize=16), rng)
+    assert 4 <= len(np.unique(rounded[:, 3])) < 100 and not rounded[::4, 3].any()
+    assert not np.array_equal(distort_intensity(points, replace(STILL, speckle=0.2), rng), points)
 
 
 @given(seeds, st.booleans())

@@ -80,6 +80,7 @@ def equals(folder: Path, other: Path) -> bool:
 
 STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,
                       flip=0, turn=0, scale=0, beam_noise=0, range_noise=0, dropout=0, intensity=0,
+                      no_intensity=0, fade=0, quantize=0, speckle=0,
                       height=0, tilt=0)
 
 

@@ -127,7 +127,7 @@ class FusedDetector(NetworkDetector):
         times = [perf_counter()]
         settings, params, config = self.settings, self.params, self.proposer.config
         view = NormalizedView.of(frame, params.ground.sensor_pose, config.low, config.high,
-                                 settings.intensity_scale)
+                                 settings.use_intensity)
         times.append(perf_counter())
         is_ground = (segment_view_ground(view.frame, params.ground) if ground is None
                      else ground.take(view.indices))

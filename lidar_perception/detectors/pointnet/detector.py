@@ -68,7 +68,7 @@ class PointNetDetector(NetworkDetector):
         t0 = perf_counter()
         settings = self.settings
         view = NormalizedView.of(frame, self.params.ground.sensor_pose,
-                                 intensity_scale=settings.intensity_scale)
+                                 use_intensity=settings.use_intensity)
         t1 = perf_counter()
         if ground is None:
             ground = segment_view_ground(view.frame, self.params.ground)

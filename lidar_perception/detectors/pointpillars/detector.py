@@ -62,7 +62,7 @@ class PointPillarsDetector(NetworkDetector):
         t0 = perf_counter()
         config, settings = self.proposer.config, self.settings
         view = NormalizedView.of(frame, self.params.ground.sensor_pose, config.low, config.high,
-                                 settings.intensity_scale)
+                                 settings.use_intensity)
         t1 = perf_counter()
         columns = run_experts(view.frame, config, view.take(ground), view.take(cluster_ids),
                           self.params.ground, self.params.clustering)

@@ -27,6 +27,7 @@ from lidar_perception.detectors.pointpillars.detector import PointPillarsDetecto
 from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
 from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.segment import segment_ground
+from lidar_perception.intensity import normalize_intensity
 from lidar_perception.scoring.points.clusters import UNKNOWN, label_clusters
 from lidar_perception.scoring.thinning import draw_subset
 from lidar_perception.training.augment import TrainingScene, raise_scene
@@ -135,7 +136,8 @@ def cut_clusters(scene: TrainingScene, config: PointNetConfig, min_points: int,
     """
     sensed = scene.points[:, :3]  # clustering uses the density that the sensor sees
     scene = raise_scene(scene, scene.height - SENSOR_HEIGHT)
-    frame = PointCloud(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
+    frame = PointCloud(np.ascontiguousarray(scene.points[:, :3]),
+                       normalize_intensity(scene.points[:, 3]))
     ground = segment_ground(frame, config.ground)
     clusters = make_clusters(frame, cluster_obstacles(frame.xyz, ground, config.clustering, sensed),
                            min_points, ground)

@@ -33,7 +33,7 @@ from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import show_progress
 from lidar_perception.scoring.detections import FrameDetections
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.training.augment import add_range_noise, vary_thing
+from lidar_perception.training.augment import add_range_noise, distort_intensity, vary_thing
 from lidar_perception.training.data import Batches, SceneReader, load_items
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
 from lidar_perception.training.pointnet.cut_scenes import MIN_POINTS_LEFT, CutScene, CutScenes
@@ -168,6 +168,7 @@ def augment_clusters(clusters: Clusters, boxes: np.ndarray, loose: np.ndarray,
     points = add_range_noise(points, params, rng)
     gain = rng.uniform(1 - params.intensity, 1 + params.intensity)
     points[:, 3] = np.clip(points[:, 3] * gain, 0, 1)
+    points = distort_intensity(points, params, rng)
     sizes = np.bincount(number[keep], minlength=count)
     first = np.concatenate([[0], np.cumsum(sizes)])
     return Clusters(points[keep], first, clusters.ids, floor), boxes

@@ -1,0 +1,58 @@
+"""KITTI's average precision of a detector with intact, distorted and missing intensity."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lidar_perception.data.open import open_recording
+from lidar_perception.detectors.contract import DetectionResult, Detector
+from lidar_perception.scoring.detections import detected
+from lidar_perception.scoring.kitti.report import DetectionReport
+from lidar_perception.types import PointCloud
+
+MIN_SCORE = 0.05  # of the boxes that average precision is computed from
+
+Change = Callable[[np.ndarray], np.ndarray | None]
+
+
+def quantize_dark(intensity: np.ndarray) -> np.ndarray:
+    """Return the intensity as of a sensor with a fifth of the gain, a gamma and 6 bits."""
+    return np.round(0.2 * intensity ** 1.5 * 63) / np.float32(63)
+
+
+CHANGES: dict[str, Change] = {
+    "as recorded": lambda intensity: intensity,
+    "times 0.4": lambda intensity: np.float32(0.4) * intensity,
+    "dark, gamma, 6 bits": quantize_dark,
+    "without": lambda intensity: None,
+}
+
+
+def evaluate_kitti(detector: Detector, folder: Path, change: Change,
+                   every: int = 1) -> dict[str, float]:
+    """Return AP (R40, moderate, percent) of KITTI object frames after a change of the intensity."""
+    report, recording = DetectionReport(), open_recording(folder)
+    low = detector.with_min_score(MIN_SCORE)
+    for frame in recording.frames[::every]:
+        report.update(detected(lambda cloud, low=low: _detect(low, cloud, change), frame,
+                               frame.truth(), frame.calibration()))
+    ap = report.compute()["ap"]
+
+    def score(name: str, row: str) -> float:
+        value = ap[name][row]["moderate"]
+        return float("nan") if value is None else value["r40"]
+
+    found = {"Car 3D .7": score("Car", "3d"), "Car BEV .7": score("Car", "bev"),
+             "Pedestrian BEV .25": score("Pedestrian", "bev_relaxed"),
+             "Cyclist BEV .25": score("Cyclist", "bev_relaxed")}
+    relaxed = [score(name, "bev_relaxed") for name in ("Car", "Pedestrian", "Cyclist")]
+    return {**found, "mean BEV .5/.25/.25": float(np.mean(relaxed))}
+
+
+def _detect(detector: Detector, cloud: PointCloud, change: Change) -> DetectionResult:
+    assert cloud.intensity is not None  # KITTI has it
+    return detector(replace(cloud, intensity=change(cloud.intensity)))
