@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -14,13 +15,15 @@ from samples import write
 from lidar_perception.nodes import NODES
 
 ROOT = Path(__file__).resolve().parents[2]
+BASE = "ros studio odometry"  # extras that every command has
+TEST = f"{BASE} test docs benchmark distributed onnx video"
 
 
-def wanted():
-    """Return the checksum by which ./lidar knows that its environment is up to date."""
+def stamp(extras=TEST):
+    """Return the text by which ./lidar knows that its environment is up to date."""
     return subprocess.run(["cksum"], input=b"".join(
         (ROOT / name).read_bytes() for name in ("constraints.txt", "setup.py", "setup.cfg")),
-        capture_output=True, check=True).stdout.decode()
+        capture_output=True, check=True).stdout.decode() + extras + "\n"
 
 
 PREFIX = Path(sys.prefix)
@@ -67,7 +70,7 @@ def test_concurrent_first_calls_make_one_environment(tmp_path):
                                  stderr=subprocess.PIPE, env={
             **os.environ, "LIDAR_VENV": str(venv), "LIDAR_PYTHON": "/bin/false"})
         assert "another call is making" in other.stderr.readline()
-        write(venv / "lidar-setup", wanted())
+        write(venv / "lidar-setup", stamp())
     assert other.communicate() == ("ran info\n", "") and other.returncode == 0
 
 
@@ -80,7 +83,7 @@ def test_a_sourced_ros_is_not_seen_while_the_environment_is_made(tmp_path):
     done = subprocess.run([ROOT / "lidar", "info"], text=True, capture_output=True, env={
         **os.environ, "PYTHONPATH": "/opt/ros/jazzy/lib", "LIDAR_VENV": str(tmp_path / "venv"),
         "LIDAR_PYTHON": str(python)})
-    assert done.returncode == 1 and "pip failed" in done.stderr  # this python makes none
+    assert done.returncode == 1 and "installing failed" in done.stderr  # this python makes none
     assert seen.read_text().split() == ["unset", "unset"]
 
 
@@ -104,7 +107,45 @@ def environment(tmp_path):
     """Return what ./lidar WORDS prints in an environment whose programs print their arguments."""
     for name in ("python", "lidar-perception"):
         write(tmp_path / "bin" / name, f"#!/bin/sh\necho {name} $*\n").chmod(0o755)
-    write(tmp_path / "lidar-setup", wanted())
+    write(tmp_path / "lidar-setup", stamp())
     return lambda words: subprocess.run(
         [ROOT / "lidar", *words.split()], text=True, capture_output=True, check=True,
         env={**os.environ, "LIDAR_VENV": str(tmp_path)}).stdout
+
+
+@pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
+@pytest.mark.parametrize("words, before, after", [
+    ("info a.bag", BASE, BASE),
+    ("test -x", BASE, TEST),
+    ("benchmark", f"{BASE} video", f"{BASE} benchmark video"),
+    ("export onnx w.safetensors", BASE, f"{BASE} onnx"),
+    ("detect a.bag --video a.mp4 --dask tcp://a", TEST, TEST)])
+def test_lidar_installs_what_a_command_needs(words, before, after, environment, tmp_path):
+    write(tmp_path / "lidar-setup", stamp(before))
+    environment(words)
+    assert (tmp_path / "lidar-setup").read_text() == stamp(after)
+    log = tmp_path / "setup.log"
+    assert not log.exists() if after == before else log.read_text() == (
+        f"python {ROOT}/scripts/set_up.py {after}\n")
+
+
+def test_uv_gets_the_configuration_of_pip(tmp_path, monkeypatch):
+    set_up = runpy.run_path(str(ROOT / "scripts/set_up.py"))
+    write(tmp_path / "pip.conf", "[global]\nindex-url = https://a/simple\nretries = 3\n"
+          "find-links = /never\nextra-index-url =\n  https://b/simple\n  https://c/simple\n"
+          "[install]\nconstraint = /d.txt\ntimeout = 9\n[freeze]\ntimeout = 10\n")
+    for name in [name for name in os.environ if name.startswith("PIP_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("PIP_CONFIG_FILE", str(tmp_path / "pip.conf"))
+    monkeypatch.setenv("PIP_FIND_LINKS", "/wheels")  # takes precedence
+    monkeypatch.setenv("PIP_CERT", "/ca.crt")
+    settings = set_up["read_pip_settings"]()
+    options, variables = set_up["find_uv_options"](settings)
+    pairs = [*zip(options[::2], options[1::2])]
+    assert {*pairs} >= {("--default-index", "https://a/simple"), ("--find-links", "/wheels"),
+                        ("--index", "https://b/simple"), ("--index", "https://c/simple"),
+                        ("--constraint", "/d.txt")}
+    assert ("--find-links", "/never") not in pairs
+    assert variables == {"SSL_CERT_FILE": "/ca.crt", "UV_HTTP_TIMEOUT": "9"}
+    assert set_up["find_uv_options"]({"no-index": "true"})[0][2:] == ["--no-index"]
+    assert set_up["find_uv_options"]({**settings, "target": "/x"}) is None  # uv has no such thing
