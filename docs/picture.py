@@ -1,4 +1,4 @@
-"""The pictures of the README, look.md and detect.md, on simulated scans: python docs/picture.py"""
+"""Draw the pictures of the README and the docs from simulated scans: python docs/picture.py"""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
@@ -30,10 +30,10 @@ from lidar_perception.types import Detections
 
 FOLDER = Path(__file__).parent / "images"
 SEED, STREETS = 9, Scenes("zone", people=3.0)
-FINER = 2  # pictures are drawn at twice their size and reduced, so that points are smooth
+FINER = 2  # pictures are drawn at twice their size and reduced, for smooth points
 README = Perspective((-9.0, -4.5, 5.2), (14.0, 1.6, -0.9), 58.0, 1600 * FINER, 720 * FINER)
 LOOK = Perspective((-12.0, -6.0, 8.0), (12.0, 1.0, -1.2), 60.0, 1600 * FINER, 800 * FINER)
-DRIVE_FRAMES, DRIVE_SEED = 20, 4
+FILM_SIZE, FILM_PERIOD_MS = (720, 405), 100
 
 
 def draw(path: Path, view: Perspective, xyz: np.ndarray, colors: np.ndarray,
@@ -46,20 +46,39 @@ def draw(path: Path, view: Perspective, xyz: np.ndarray, colors: np.ndarray,
     write_png(path, np.asarray(Image.fromarray(canvas.pixels).reduce(FINER)))
 
 
+def detect_in_drive(folder: Path, simulation: list[str], detection: list[str]) -> None:
+    """Simulate a drive and run `detect --track` on it; results are in `folder`/out."""
+    drive = str(folder / "drive")
+    for words in (["simulate", "--out", drive, *simulation],
+                  ["detect", drive, "--out", str(folder / "out"), "--track", *detection]):
+        with suppress(SystemExit):
+            cli(words, standalone_mode=False)
+
+
 def draw_detect(path: Path) -> None:
     """Draw the last frame of a simulated drive by `detect --track --png`."""
-    with tempfile.TemporaryDirectory() as folder:
-        drive, out = f"{folder}/drive", Path(folder) / "out"
-        for words in (["simulate", "--out", drive, "--frames", str(DRIVE_FRAMES), "--seed",
-                       str(DRIVE_SEED)],
-                      ["detect", drive, "--out", str(out), "--track", "--png"]):
-            with suppress(SystemExit):
-                cli(words, standalone_mode=False)
-        path.write_bytes(sorted((out / "png").rglob("*.png"))[-1].read_bytes())
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        detect_in_drive(folder, ["--frames", "20", "--seed", "4"], ["--png"])
+        path.write_bytes(sorted((folder / "out/png").rglob("*.png"))[-1].read_bytes())
+
+
+def draw_film(path: Path) -> None:
+    """Draw a simulated drive by `detect --track --video`, reduced to the size of the README."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        detect_in_drive(folder, ["--frames", "40", "--seed", str(SEED), "--kind", "zone",
+                                 "--people", "2"],
+                        ["--range", "around", "--video", str(folder / "film.webp")])
+        with Image.open(folder / "film.webp") as film:
+            frames = [frame.convert("RGB").resize(FILM_SIZE, Image.Resampling.LANCZOS)
+                      for frame in ImageSequence.Iterator(film)]
+        frames[0].save(path, save_all=True, append_images=frames[1:], duration=FILM_PERIOD_MS,
+                       loop=0, quality=40, method=4)
 
 
 def make(folder: Path = FOLDER) -> None:
-    """Simulate scans, run the package on them, write the pictures."""
+    """Simulate scans, run the package on them, and write the pictures."""
     frame = simulate_scan(SEED, 0, HDL64E, STREETS).frame
     params = DetectorParams()
     found = open_detector("pointpillars")(frame).detections
@@ -68,12 +87,13 @@ def make(folder: Path = FOLDER) -> None:
     cluster_ids[~ground] = cluster(frame.xyz[~ground], params.clustering)
     draw(folder / "scene.png", README, frame.xyz, color_by_cluster(ground, cluster_ids), found)
 
-    # The displays that are on in the layouts: clusters, the ground, detections and candidates.
+    # Default displays of the layouts: clusters, ground, detections and candidates.
     segmented, candidates = find_candidates(frame, make_fixed_source(load_seed(
         PipelineParams().seed.file)))
     draw(folder / "look.png", LOOK, segmented.xyz, color_by_cluster(
         segmented.ground, segmented.cluster_ids), found.followed_by(candidates.final))
     draw_detect(folder / "detect.png")
+    draw_film(folder / "detect.webp")
 
 
 if __name__ == "__main__":
