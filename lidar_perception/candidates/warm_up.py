@@ -1,4 +1,8 @@
-"""Warm-up of the candidate pipeline: compiles or loads its code before the first cloud."""
+"""Warm-up of the candidate pipeline: compiles or loads its code before the first cloud.
+
+A node warms up what its parameters make it run; code of another method is compiled when the
+parameter changes.
+"""
 
 from __future__ import annotations
 
@@ -9,32 +13,84 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import make_automatic_source
 from lidar_perception.candidates.seeds import seed_from_points
+from lidar_perception.candidates.segmented_cloud import crop_to_view, fit_grounded_boxes
+from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.euclidean import cluster_euclidean
-from lidar_perception.clustering.params import EuclideanParams
+from lidar_perception.clustering.params import BoxParams, ClusteringParams
+from lidar_perception.ground.params import GroundParams
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.ground.threshold import compute_inlier_share, fit_plane
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.compiling import report_compilation
 from lidar_perception.types import PointCloud
 from lidar_perception.wire.params import ViewParams
 
+CAMERA = Camera(np.array([[50, -100, 0, 0], [50, 0, -100, 0], [1, 0, 0, 0]], float), 100, 100)
+
 
 @report_compilation(whole_detector=True)
 def warm_up() -> None:
     """Run every stage and method once on synthetic points to trigger JIT compilation."""
-    rng = np.random.default_rng(0)
-    flat = rng.uniform(-20, 20, (600, 3)) * [1, 1, 0.001] - [0, 0, 1.7]
-    person = rng.uniform(-0.5, 0.5, (400, 3)) * [0.5, 0.5, 1.7] + [8, 0, -0.8]
-    dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 2, 0]  # for DBSCAN by cells
-    across = rng.uniform(-0.1, 0.1, (200, 3)) + [15, 0, 0]  # across the limit of two bands
-    xyz = np.concatenate([flat, person, person + [12, 0, 0], dense, across]).astype(np.float32)
-    seed = seed_from_points(person.astype(np.float32), np.array([8, 0, -0.85, 1, 1, 1.7, 0]))
-    forward = Camera(np.array([[50, -100, 0, 0], [50, 0, -100, 0], [1, 0, 0, 0]], float), 100, 100)
-    base = PipelineParams(view=ViewParams(enabled=True))
     for ground, clustering, boxes, sure in (("threshold", "dbscan", "axis_aligned", False),
                                             ("cloth", "euclidean", "l_shape", True)):
-        params = with_values(base, {
+        warm_up_candidates(with_values(PipelineParams(view=ViewParams(enabled=True)), {
             "ground.method": ground, "clustering.method": clustering, "boxes.shape": boxes,
-            "clustering.dbscan.join_bands": True, "confidence.enabled": sure,
-            "seed.min_confidence": 0.0})
-        find_candidates(PointCloud(xyz), make_automatic_source(seed, params), forward, params)
-    for threshold in ("local", "global"):  # the tree, which only dense clouds need
-        cluster_euclidean(person.astype(np.float32), EuclideanParams(threshold=threshold), -1, 0)
+            "clustering.dbscan.join_bands": True, "confidence.enabled": sure}))
+    for threshold in ("local", "global"):
+        _warm_up_tree(with_values(ClusteringParams(), {"method": "euclidean",
+                                                       "euclidean.threshold": threshold}))
+
+
+def warm_up_ground(params: GroundParams, view: ViewParams = ViewParams()) -> None:
+    """Compile the ground segmentation and the plane of its diagnostics."""
+    cloud = _make_cloud()
+    _, cloud = crop_to_view(cloud, CAMERA, view)
+    segment_ground(cloud, params)
+    plane = fit_plane(cloud.xyz)
+    if plane is not None:
+        compute_inlier_share(cloud.xyz, plane)
+
+
+def warm_up_clustering(params: ClusteringParams, boxes: BoxParams) -> None:
+    """Compile the clustering, also of dense clouds, and the boxes of clusters."""
+    cloud = _make_cloud()
+    ground = np.zeros(len(cloud), bool)
+    ids = cluster_obstacles(cloud.xyz, ground, params)
+    fit_grounded_boxes(cloud.xyz, ground, ids, boxes)
+    _warm_up_tree(params)
+
+
+def warm_up_candidates(params: PipelineParams, segmented: bool = False) -> None:
+    """Compile the pipeline; if `segmented`, only the stages behind the clustering."""
+    person = _make_person()
+    seed = seed_from_points(person, np.array([8, 0, -0.85, 1, 1, 1.7, 0]))
+    params = with_values(params, {"seed.min_confidence": 0.0})
+    cloud = _make_cloud()
+    ids = np.arange(len(cloud)) // 200
+    columns = dict(ground=ids < 3, cluster_ids=np.maximum(ids - 2, 0)) if segmented else {}
+    find_candidates(cloud, make_automatic_source(seed, params), CAMERA, params, **columns)
+    if not segmented:
+        _warm_up_tree(params.clustering)
+
+
+def _warm_up_tree(params: ClusteringParams) -> None:
+    """Compile the tree of Euclidean clustering, which only dense clouds need."""
+    if params.method == "euclidean":
+        cluster_euclidean(_make_person(), params.euclidean, -1, 0)
+
+
+def _make_person() -> np.ndarray:
+    """Return (400, 3) float32 points in the volume of a person."""
+    rng = np.random.default_rng(0)
+    return (rng.uniform(-0.5, 0.5, (400, 3)) * [0.5, 0.5, 1.7] + [8, 0, -0.8]).astype(np.float32)
+
+
+def _make_cloud() -> PointCloud:
+    """Return 600 points of flat ground and 3,000 of objects."""
+    rng = np.random.default_rng(0)
+    flat = rng.uniform(-20, 20, (600, 3)) * [1, 1, 0.001] - [0, 0, 1.7]
+    person = _make_person()
+    dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 2, 0]  # for DBSCAN by cells
+    across = rng.uniform(-0.1, 0.1, (200, 3)) + [15, 0, 0]  # across the limit of two bands
+    xyz = np.concatenate([flat, person, person + [12, 0, 0], dense, across])
+    return PointCloud(xyz.astype(np.float32))

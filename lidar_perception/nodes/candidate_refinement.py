@@ -6,20 +6,20 @@ from typing import Any
 
 import numpy as np
 
+from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import refine_segmented
 from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud, fit_grounded_boxes
-from lidar_perception.candidates.warm_up import warm_up
+from lidar_perception.candidates.warm_up import warm_up_candidates
 from lidar_perception.nodes.inputs import SeedInput
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import CandidateOutputs
 from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.params import DetectionNodeParams, RefinementNodeParams
+from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import read_cluster_ids, read_column, to_point_cloud
 from msg_utils.stamps import to_ns
-
-__all__ = ["CandidateRefinement", "warm_up"]
 
 
 class CandidateRefinement(ManagedNode):
@@ -30,6 +30,8 @@ class CandidateRefinement(ManagedNode):
                          DetectionNodeParams(), **options)
 
     def configure(self) -> None:
+        with lock_compilation(self.get_logger().info):
+            warm_up_candidates(PipelineParams(**vars(self.params)), segmented=True)
         self.outputs = CandidateOutputs(self)
         self.seed = SeedInput(self, self.on_cloud)
         self.input("points", CLOUD, self.seed.add_cloud)

@@ -7,18 +7,17 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.candidates.segmented_cloud import diagnose_empty, fit_grounded_boxes
-from lidar_perception.candidates.warm_up import warm_up
+from lidar_perception.candidates.warm_up import warm_up_clustering
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import ClusterBoxes
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.params import BoxNodeParams, ClusteringNodeParams
+from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import read_column, scatter_values, to_point_cloud
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
-
-__all__ = ["Clustering", "warm_up"]
 
 
 class Clustering(ManagedNode):
@@ -31,6 +30,8 @@ class Clustering(ManagedNode):
         super().__init__("clustering", ClusteringNodeParams(), BoxNodeParams(), **options)
 
     def configure(self) -> None:
+        with lock_compilation(self.get_logger().info):
+            warm_up_clustering(self.params.clustering, self.params.boxes)
         self.points = self.output("points", CLOUD)
         self.boxes = ClusterBoxes(self)
         self.input("points", CLOUD, self.on_points)

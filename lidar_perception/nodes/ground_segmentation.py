@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from lidar_perception.candidates.segmented_cloud import crop_to_view, diagnose_empty
-from lidar_perception.candidates.warm_up import warm_up
+from lidar_perception.candidates.warm_up import warm_up_ground
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.ground.threshold import compute_inlier_share, fit_plane
 from lidar_perception.nodes.inputs import CameraInput
@@ -14,12 +14,11 @@ from lidar_perception.nodes.outputs import Obstacles
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import GroundNodeParams, GroundRobotParams
+from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import scatter_values
 from msg_utils.point_cloud2 import add_columns, from_array, to_array
 from msg_utils.stamps import to_ns
-
-__all__ = ["GroundSegmentation", "warm_up"]
 
 
 class GroundSegmentation(ManagedNode):
@@ -32,6 +31,8 @@ class GroundSegmentation(ManagedNode):
         super().__init__("ground_segmentation", GroundNodeParams(), GroundRobotParams(), **options)
 
     def configure(self) -> None:
+        with lock_compilation(self.get_logger().info):
+            warm_up_ground(self.params.ground, self.params.view)
         self.camera = CameraInput(self)
         self.sensor = SensorCheck(self)
         self.points = self.output("points", CLOUD)

@@ -71,15 +71,10 @@ def run(name: str, arguments: list[str]) -> int:
         return 2
     from rclpy.logging import get_logger
 
-    from lidar_perception.runs.compiling import lock_compilation, report_compilation
+    from lidar_perception.runs.compiling import report_compilation
     say = get_logger(_logger_name(nodes[0])).info
     with report_compilation(say):
         classes = [load_node_class(each[0]) for each in nodes]
-        modules = [sys.modules[node_class.__module__] for node_class in classes]
-        for warm_up in dict.fromkeys(getattr(module, "warm_up", None) for module in modules):
-            if warm_up:
-                with lock_compilation(say):
-                    warm_up()
     if len(nodes) == 1 and not shared:
         return _spin(classes[0], nodes[0], begin, stop)
     return _spin_together(list(zip(classes, nodes)), shared, begin, stop)

@@ -8,19 +8,18 @@ from lidar_perception.candidates.params import STEPS, PipelineParams
 from lidar_perception.candidates.pipeline import refine_segmented, segment_cloud
 from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented_cloud import diagnose_empty
-from lidar_perception.candidates.warm_up import warm_up
+from lidar_perception.candidates.warm_up import warm_up_candidates
 from lidar_perception.nodes.inputs import CameraInput, SeedInput
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes, Obstacles
 from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import PerceptionRobotParams
+from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import scatter_values
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
-
-__all__ = ["Perception", "warm_up"]
 
 
 class Perception(ManagedNode):
@@ -31,6 +30,8 @@ class Perception(ManagedNode):
         super().__init__("perception", PipelineParams(), PerceptionRobotParams(), **options)
 
     def configure(self) -> None:
+        with lock_compilation(self.get_logger().info):
+            warm_up_candidates(self.params)
         self.camera = CameraInput(self)
         self.sensor = SensorCheck(self)
         self.outputs = CandidateOutputs(self, STEPS)
