@@ -1,4 +1,4 @@
-"""A node warms up what it runs, and nothing else."""
+"""Warm-up compiles the code that a node runs, and no other."""
 
 from __future__ import annotations
 
