@@ -98,8 +98,8 @@ def test_lidar_runs_tests_and_benchmark_from_the_checkout(words, ran, environmen
 
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
 def test_help_of_lidar_mentions_test_and_benchmark(environment):
-    first, *_, last = environment("--help").splitlines()
-    assert first == "lidar-perception --help" and "test" in last and "benchmark" in last
+    first, *more = environment("--help").splitlines()
+    assert first == "lidar-perception --help" and {"test", "benchmark"} <= {*" ".join(more).split()}
 
 
 @pytest.fixture
