@@ -1,1 +1,1 @@
-"""Simulated against real scans."""
+"""Comparison of simulated with real scans."""

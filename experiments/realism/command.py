@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from experiments.realism.compare import evenly, measured_scans, side_by_side
+from experiments.realism.compare import compare_scans, measure_scans, select_frames
 from experiments.realism.report import draw_realism, print_realism
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.warm_up import warm_up
@@ -43,12 +43,12 @@ def realism(data: Path, sensor: str, mount_height: float, frames: int, seed: int
     model = find_sensor(sensor, mount_height)
     recording = open_and_describe(data)
     recording.require(BOXES, "realism")
-    chosen = evenly(recording)
+    chosen = select_frames(recording)
     warm_up()
-    measured = measured_scans(show_progress(chosen, "measuring real scans", len(chosen)), PAPER)
+    measured = measure_scans(show_progress(chosen, "measuring real scans", len(chosen)), PAPER)
     made = simulate_frames(seed, frames, model, streets_of=1, scenes=Scenes(None, people, "street"))
-    simulated = measured_scans(show_progress(made, "measuring simulated scans", frames), PAPER)
-    content = {"data": str(data), "seed": seed, **side_by_side(measured, simulated)}
+    simulated = measure_scans(show_progress(made, "measuring simulated scans", frames), PAPER)
+    content = {"data": str(data), "seed": seed, **compare_scans(measured, simulated)}
     print_realism(content, console)
     write_json(json, content)
     if png:

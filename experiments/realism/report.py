@@ -1,4 +1,4 @@
-"""Tables and a picture of simulated against real scans."""
+"""Tables and a picture of the comparison of simulated and real scans."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from experiments.realism.compare import MIN_SAMPLES, factor_off
+from experiments.realism.compare import MIN_SAMPLES, compute_factor
 from experiments.realism.scan_statistics import CURVES
 from lidar_perception.scoring.pictures import save_picture
 from lidar_perception.scoring.tables import format_number, make_table, print_skipped
@@ -18,7 +18,7 @@ PANELS = 5  # in a row
 
 
 def print_realism(content: dict, console: Console) -> None:
-    """What was compared, a table of the curves and one of the worst bins, and the summary."""
+    """Print the numbers of scans, the curves, the worst bins, and a summary."""
     for side in ("real", "simulated"):
         row = content[side]
         objects = ", ".join(f"{count} {name}" for name, count in row["objects"].items())
@@ -27,18 +27,18 @@ def print_realism(content: dict, console: Console) -> None:
     _print_curves(content, console)
     _print_worst(content, console)
     print_skipped(content["real"]["skipped"] + content["simulated"]["skipped"], console)
-    console.print(summary(content), style="bold")
+    console.print(format_summary(content), style="bold")
 
 
-def summary(content: dict) -> str:
-    """How many of the judged bins are right, and how many plausible."""
+def format_summary(content: dict) -> str:
+    """Return a line with the numbers of right and of plausible bins."""
     return (f"{content['within']} of {content['judged']} bins within 20 % of the real median, "
             f"{content['plausible']} with those within its 95 % interval")
 
 
-def typical_factor(curve: dict) -> float | None:
-    """Median of the factors by which the judged bins are off; None without judged bins."""
-    factors = sorted(factor_off(b) for b in curve["bins"] if b["within"] is not None)
+def find_typical_factor(curve: dict) -> float | None:
+    """Return the median factor of the judged bins; None without judged bins."""
+    factors = sorted(compute_factor(b) for b in curve["bins"] if b["within"] is not None)
     return factors[len(factors) // 2] if factors else None
 
 
@@ -46,10 +46,10 @@ def _print_curves(content: dict, console: Console) -> None:
     table = make_table("Simulated against real, worst curves first",
                    "curve", "within 20 %", "typical", "worst at", "ratio")
     judged = [c for c in content["curves"].values() if c["judged"]]
-    for curve in sorted(judged, key=lambda c: (c["share"], -(typical_factor(c) or 0.0))):
-        worst = max((b for b in curve["bins"] if b["within"] is not None), key=factor_off)
-        table.add_row(_title(curve), f"{curve['within']} of {curve['judged']}",
-                      format_number(typical_factor(curve), width=9), worst["bin"],
+    for curve in sorted(judged, key=lambda c: (c["share"], -(find_typical_factor(c) or 0.0))):
+        worst = max((b for b in curve["bins"] if b["within"] is not None), key=compute_factor)
+        table.add_row(_format_title(curve), f"{curve['within']} of {curve['judged']}",
+                      format_number(find_typical_factor(curve), width=9), worst["bin"],
                       format_number(worst["ratio"], width=9))
     unknown = sum(not curve["judged"] and not CURVES[name].histogram
                   for name, curve in content["curves"].items())
@@ -64,31 +64,35 @@ def _print_worst(content: dict, console: Console) -> None:
             if b["within"] is False]
     table = make_table(f"The {min(WORST, len(bins))} worst bins of {len(bins)} not within 20 %",
                    "curve", "bin", "real", "10..90 %", "n", "sim.", "10..90 %", "n", "ratio")
-    for curve, b in sorted(bins, key=lambda item: -factor_off(item[1]))[:WORST]:
-        table.add_row(_title(curve), b["bin"],
-                      *(cell for side in ("real", "simulated") for cell in _cells(b[side])),
+    for curve, b in sorted(bins, key=lambda item: -compute_factor(item[1]))[:WORST]:
+        table.add_row(_format_title(curve), b["bin"],
+                      *(cell for side in ("real", "simulated") for cell in _format_cells(b[side])),
                       format_number(b["ratio"], width=9))
     table.caption = "Median and spread of the scans or objects, n of them."
     if bins:
         console.print(table)
 
 
-def _title(curve: dict) -> str:
+def _format_title(curve: dict) -> str:
     by = " by elevation" if curve["axis"].startswith("elevation") else ""
     return curve["title"].removesuffix(" [m]") + by
 
 
-def _cells(side: dict) -> list[str]:
-    spread = "" if side["low"] is None else f"{_number(side['low'])}..{_number(side['high'])}"
-    return [_number(side["median"]), spread, str(side["n"])]
+def _format_cells(side: dict) -> list[str]:
+    ends = [_format_value(side[end]) for end in ("low", "high") if side[end] is not None]
+    return [_format_value(side["median"]), "..".join(ends), str(side["n"])]
 
 
-def _number(value: float | None) -> str:
+def _format_value(value: float | None) -> str:
     return "-" if value is None else f"{value:.0f}" if value >= 100 else f"{value:.2g}"
 
 
 def draw_realism(path: Path, content: dict) -> None:
-    """Write a PNG: every curve of real and simulated, median and 10 to 90 %."""
+    """Write a PNG of every curve, with the median and the 10 to 90 % range.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
     import matplotlib
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
@@ -105,7 +109,7 @@ def draw_realism(path: Path, content: dict) -> None:
                Patch(color="#eeeeee", label=f"fewer than {MIN_SAMPLES} real samples"),
                Patch(color=WRONG, label="red title: most bins are wrong")]
     figure.legend(handles=handles, loc="outside lower right", ncols=4, fontsize=13)
-    figure.suptitle(f"{summary(content)}; {content['real']['scans']} real "
+    figure.suptitle(f"{format_summary(content)}; {content['real']['scans']} real "
                     f"scans, {content['simulated']['scans']} simulated\nmedian and 10 to 90 % of "
                     "the scans or objects; [bins within 20 % / bins judged]", x=0.01, ha="left",
                     fontsize=15)
@@ -113,7 +117,7 @@ def draw_realism(path: Path, content: dict) -> None:
 
 
 def _draw_curve(axes, curve: dict, log: bool) -> None:
-    """One panel; bins with too few real samples to be judged are grey."""
+    """Draw one panel; bins with too few real samples to be judged are grey."""
     positions = range(len(curve["bins"]))
     for side, color, shift in (("real", REAL, -0.08), ("simulated", SIMULATED, 0.08)):
         median, low, high = (_column(curve, side, key) for key in ("median", "low", "high"))
@@ -139,7 +143,7 @@ def _draw_curve(axes, curve: dict, log: bool) -> None:
 
 
 def _draw_histogram(axes, curve: dict, _log: bool) -> None:
-    """One panel; the bars start at the names of their bins."""
+    """Draw one panel; bars start at the names of their bins."""
     positions = range(len(curve["bins"]))
     for side, color, alpha in (("real", REAL, 0.5), ("simulated", SIMULATED, 0.35)):
         share = _column(curve, side, "median")

@@ -1,6 +1,6 @@
-"""What a scan and its labelled objects are like, as numbers by range, angle or quantile.
+"""Statistics of a scan and its labelled objects, by range, angle or quantile.
 
-A scan or an object gives a curve one row of values (B,), one a bin; NaN is no sample.
+Each scan or object adds one row (B,) to a curve, with one value for each bin; NaN is no sample.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
-from experiments.realism.roughness import roughness
+from experiments.realism.roughness import compute_roughness
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.boxes import select_by_height
 from lidar_perception.candidates.params import PipelineParams
@@ -26,11 +26,11 @@ from lidar_perception.scoring.centres.matching import RANGE_NAMES
 from lidar_perception.types import GroundTruth, PointCloud
 
 CLASSES = tuple(DETECTED)
-PERSON_HEIGHT = 1.7       # metres; the seed's height for the height filter of paper A's stage 1
-SECTORS, WHOLE = 36, 27   # of a turn; a scan with points in fewer is cropped to a camera's view
-MIN_POINTS = 5          # of an object whose extent or intensity is measured
-MIN_IN_BIN = 50         # points of a scan in a range bin whose ground share is measured
-QUERIES, MIN_QUERIES = 600, 10  # points in a range bin whose neighbour is measured
+PERSON_HEIGHT = 1.7       # metres; seed height of the height filter in stage 1 of the STM-CPA paper
+SECTORS, MIN_SECTORS = 36, 27   # of a turn; a scan with points in fewer is cropped to a view
+MIN_POINTS = 5          # of an object, to measure its extent or intensity
+MIN_IN_BIN = 50         # points in a range bin, to measure its ground share
+MAX_QUERIES, MIN_QUERIES = 600, 10  # points in a range bin, to measure neighbours
 RANGES = np.array([0.0, 5, 10, 15, 20, 30, 40, 60, 80, np.inf])
 OBJECT_RANGES = np.array([0.0, 10, 20, 30, 45, 60])
 ELEVATIONS = np.arange(-26.0, 4.1, 2.0)
@@ -38,23 +38,28 @@ QUANTILES = (5, 25, 50, 75, 95)
 INTENSITIES = np.arange(20) * 0.05 - 0.005  # between the steps of KITTI's reflectance
 INTENSITY_STEP = 0.01
 ROUGH_STEP = 0.002        # metres
-BELT = 0.65               # of an object's height; above it a car has windows
+BELT = 0.65               # share of an object's height; above it a car has windows
 CAR_NAME = CLASSES[CAR]
-FROM = f"{CAR_NAME} from "
-# Where a sensor stands, in degrees from straight ahead of a car, that sees one face of it only.
+CAR_FROM = f"{CAR_NAME} from "
+# Directions from which a sensor sees only one face of a car, degrees from its front.
 FACES = {"behind": (160.0, 180.0), "the side": (45.0, 135.0), "the front": (0.0, 20.0)}
-FACE_POINTS, FACE_QUANTILES, FACE_STEP = 20, (10, 25, 50), 0.01  # the step in metres
+MIN_FACE_POINTS, FACE_QUANTILES, FACE_STEP = 20, (10, 25, 50), 0.01  # the step in metres
 SCORES = {"precision": ("tp", "fp"), "recall": ("tp", "fn"), "f1": ("tp", "fp", "fn")}
 
 
-def _names(limits: np.ndarray) -> tuple[str, ...]:
+def _name_bins(limits: np.ndarray) -> tuple[str, ...]:
     return tuple(f"{a:g}+" if math.isinf(b) else f"{a:g}-{b:g}" for a, b in pairwise(limits))
 
 
 @dataclass(frozen=True)
 class Curve:
-    """What is measured, over which bins. log: it spans decades. step: a difference as small as
-    that means nothing. histogram: shares, whose mean is taken and which are not judged."""
+    """A measured quantity over bins.
+
+    Attributes:
+        log: The values span decades.
+        step: Resolution; smaller differences mean nothing.
+        histogram: The values are shares. Their mean is shown, and they are not judged.
+    """
 
     title: str
     bins: tuple[str, ...]
@@ -64,12 +69,12 @@ class Curve:
     histogram: bool = False
 
 
-_BY_RANGE, _BY_OBJECT_RANGE = _names(RANGES), _names(OBJECT_RANGES)
+_BY_RANGE, _BY_OBJECT_RANGE = _name_bins(RANGES), _name_bins(OBJECT_RANGES)
 _BY_QUANTILE = tuple(f"{q}%" for q in QUANTILES)
 _BY_INTENSITY = tuple(f"{i * 0.05:.2f}" for i in range(20))
-_LIT = ("ground", "above ground", *CLASSES)
+_SURFACES = ("ground", "above ground", *CLASSES)
 CURVES = {
-    "scan points": Curve("points a scan", ("all",), ""),
+    "scan points": Curve("points per scan", ("all",), ""),
     "points": Curve("points", _BY_RANGE, log=True),
     "elevation": Curve("points", tuple(f"{a:g}..{a + 2:g}" for a in ELEVATIONS[:-1]),
                        "elevation [deg]", log=True),
@@ -78,18 +83,18 @@ CURVES = {
     "neighbour": Curve("distance to the nearest point [m]", _BY_RANGE),
     "clusters": Curve("clusters", _BY_RANGE),
     "person clusters": Curve("clusters as high as a person", _BY_RANGE),
-    **{f"{name} density": Curve(f"{name}: points a square degree", _BY_OBJECT_RANGE)
+    **{f"{name} density": Curve(f"{name}: points per square degree", _BY_OBJECT_RANGE)
        for name in CLASSES},
     **{f"{what} intensity": Curve(f"intensity, {what}", _BY_QUANTILE, "quantile",
-                                  step=INTENSITY_STEP) for what in _LIT},
+                                  step=INTENSITY_STEP) for what in _SURFACES},
     **{f"{what} intensity histogram": Curve(f"share of points, {what}", _BY_INTENSITY, "intensity",
-                                            histogram=True) for what in _LIT},
+                                            histogram=True) for what in _SURFACES},
     **{f"{name} {what}": Curve(f"{name}: {title}", _BY_OBJECT_RANGE, log="points" in what)
        for name in CLASSES for what, title in (
            ("points", "points, not occluded"), ("points of all", "points, all"),
            ("height", "height seen / box"), ("length", "length seen / box"),
            ("width", "width seen / box"), ("above", "points above 0.65 of the height"))},
-    **{FROM + face: Curve(f"{FROM}{face}: how far in its box the points are [m]",
+    **{CAR_FROM + face: Curve(f"{CAR_FROM}{face}: depth of the points in the box [m]",
                           tuple(f"{q}%" for q in FACE_QUANTILES), "quantile", step=FACE_STEP)
        for face in FACES},
     **{f"{stage} {score}": Curve(f"paper A, {stage}: {score}", (*RANGE_NAMES, "all"))
@@ -98,53 +103,58 @@ CURVES = {
 
 
 def is_whole(frame: PointCloud) -> bool:
-    """Whether the points lie all around the sensor, not in a camera's view only."""
+    """Return True if there are points all around the sensor, not only in a camera's view."""
     turn = np.arctan2(frame.xyz[:, 1], frame.xyz[:, 0]) / (2 * np.pi) + 0.5
-    return len(np.unique((turn * SECTORS).astype(int) % SECTORS)) >= WHOLE
+    return len(np.unique((turn * SECTORS).astype(int) % SECTORS)) >= MIN_SECTORS
 
 
-def scan_rows(frame: PointCloud, params: PipelineParams = PipelineParams()) -> dict:
-    """Curve to its rows (1, B) of one whole scan; params are those of the clusters. Ground is what
-    the cloth finds."""
+def compute_scan_rows(frame: PointCloud, params: PipelineParams = PipelineParams()) -> dict:
+    """Return the row (1, B) of each curve for one whole scan.
+
+    params apply to the clusters; ground is segmented by the cloth method.
+    """
     xyz, bins = frame.xyz, len(RANGES) - 1
     reach = horizontal_range(xyz)
-    where, elevation = _bin(reach, RANGES), np.degrees(np.arctan2(xyz[:, 2], reach))
+    where, elevation = _find_bins(reach, RANGES), np.degrees(np.arctan2(xyz[:, 2], reach))
     count = np.bincount(where, minlength=bins)
     ground = segment_ground(frame, GroundParams(method="cloth"))
     on_ground = np.bincount(where.compress(ground), minlength=bins)
     boxes = segment_cloud(frame, params=params).boxes
-    at = _bin(horizontal_range(boxes), RANGES)
+    at = _find_bins(horizontal_range(boxes), RANGES)
     person = select_by_height(boxes, PERSON_HEIGHT, params.height)
     rows = {"scan points": [len(xyz)], "points": count,
             "elevation": np.histogram(elevation, ELEVATIONS)[0],
             "ground share": np.where(count >= MIN_IN_BIN, on_ground / np.maximum(count, 1),
                                      np.nan),
-            "roughness": roughness(xyz, RANGES),
-            "neighbour": _neighbours(xyz, where),
+            "roughness": compute_roughness(xyz, RANGES),
+            "neighbour": _measure_neighbours(xyz, where),
             "clusters": np.bincount(at, minlength=bins),
             "person clusters": np.bincount(at[person], minlength=bins)}
     if frame.intensity is not None:
         for name, mask in (("ground", ground), ("above ground", ~ground)):
-            rows.update(_intensity(name, frame.intensity.compress(mask)))
+            rows.update(_describe_intensity(name, frame.intensity.compress(mask)))
     return {curve: np.atleast_2d(np.asarray(row, float)) for curve, row in rows.items()}
 
 
-def object_rows(frame: PointCloud, truth: GroundTruth, camera: Camera | None) -> dict:
-    """Curve to the rows (K, B) of the labelled objects with a point that the camera sees whole: of
-    the others KITTI's labels and cropped scans hold a part; of all without a camera. Occluded ones,
-    as their labels say, count for `points of all` and intensity only."""
+def compute_object_rows(frame: PointCloud, truth: GroundTruth, camera: Camera | None) -> dict:
+    """Return the rows (K, B) of each curve for labelled objects with at least one point.
+
+    With a camera, only objects that it sees completely count: labels and cropped scans of KITTI
+    contain parts of the others. Objects labelled as occluded count for `points of all` and
+    intensity only.
+    """
     rows: dict[str, list] = {}
     bins = len(_BY_OBJECT_RANGE)
     for i, (box, name) in enumerate(zip(truth.boxes, truth.labels)):
-        at = _bin(horizontal_range(box[None]), OBJECT_RANGES)[0]
-        if name not in CLASSES or at == bins or not _seen_whole(camera, box):
+        at = _find_bins(horizontal_range(box[None]), OBJECT_RANGES)[0]
+        if name not in CLASSES or at == bins or not _is_seen_whole(camera, box):
             continue
         inside = np.flatnonzero(points_in_box(frame.xyz, box))
         if len(inside) == 0:
             continue
         values: dict[str, float] = {"points of all": len(inside)}
         if truth.extras[i].get("occluded", 0) == 0:
-            values |= {"points": len(inside), "density": len(inside) / square_degrees(box)}
+            values |= {"points": len(inside), "density": len(inside) / compute_square_degrees(box)}
             if len(inside) >= MIN_POINTS:
                 own = to_box_frame(frame.xyz[inside].astype(float), box) / box[3:6]
                 values |= dict(zip(("length", "width", "height"), np.ptp(own, axis=0)))
@@ -152,18 +162,20 @@ def object_rows(frame: PointCloud, truth: GroundTruth, camera: Camera | None) ->
         new = {f"{name} {what}": np.where(np.arange(bins) == at, value, np.nan)
                for what, value in values.items()}
         if frame.intensity is not None and len(inside) >= MIN_POINTS:
-            new |= _intensity(name, frame.intensity[inside])
+            new |= _describe_intensity(name, frame.intensity[inside])
         if name == CAR_NAME and truth.extras[i].get("occluded", 0) == 0:
-            new |= _depths(frame.xyz[inside].astype(float), box)
+            new |= _measure_depths(frame.xyz[inside].astype(float), box)
         for curve, row in new.items():
             rows.setdefault(curve, []).append(row)
     return {curve: np.array(values) for curve, values in rows.items()}
 
 
-def _depths(xyz: np.ndarray, box: np.ndarray) -> dict:
-    """Of the points (N, 3) in a car's box the quantiles of the distance to the face of the box that
-    the sensor looks at, if it sees one face only and enough points."""
-    if len(xyz) < FACE_POINTS:
+def _measure_depths(xyz: np.ndarray, box: np.ndarray) -> dict:
+    """Return quantiles of the distance between points (N, 3) of a car and the face that is seen.
+
+    Empty if the sensor sees two faces or there are too few points.
+    """
+    if len(xyz) < MIN_FACE_POINTS:
         return {}
     sensor, own = to_box_frame(np.zeros((1, 3)), box)[0], to_box_frame(xyz, box)
     angle = abs(np.degrees(np.arctan2(sensor[1], sensor[0])))
@@ -171,43 +183,43 @@ def _depths(xyz: np.ndarray, box: np.ndarray) -> dict:
         if low <= angle <= high:
             axis = int(face == "the side")
             depth = box[3 + axis] / 2 - np.sign(sensor[axis]) * own[:, axis]
-            return {FROM + face: np.quantile(depth, np.array(FACE_QUANTILES) / 100)}
+            return {CAR_FROM + face: np.quantile(depth, np.array(FACE_QUANTILES) / 100)}
     return {}
 
 
-def square_degrees(box: np.ndarray) -> float:
-    """Of the sensor's view that a standing rectangle, as wide and high as box (7,) looks from the
-    sensor, covers at the range of its centre."""
+def compute_square_degrees(box: np.ndarray) -> float:
+    """Return the solid angle of a box (7,), as an upright rectangle, in square degrees."""
     reach = np.hypot(box[0], box[1])
     turned = box[6] - np.arctan2(box[1], box[0])
     width = box[3] * abs(np.sin(turned)) + box[4] * abs(np.cos(turned))
     return float(np.prod(np.degrees(2 * np.arctan2([width / 2, box[5] / 2], reach))))
 
 
-def _seen_whole(camera: Camera | None, box: np.ndarray) -> bool:
+def _is_seen_whole(camera: Camera | None, box: np.ndarray) -> bool:
     return camera is None or bool(camera.in_view(box_corners(box[None])[0]).all())
 
 
-def _bin(values: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """(N,) index of the bin; len(limits) - 1 beyond the last."""
+def _find_bins(values: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Return the index of the bin of each value (N,); len(limits) - 1 beyond the last bin."""
     return np.searchsorted(limits, values, side="right") - 1
 
 
-def _neighbours(xyz: np.ndarray, where: np.ndarray) -> np.ndarray:
+def _measure_neighbours(xyz: np.ndarray, where: np.ndarray) -> np.ndarray:
     row = np.full(len(RANGES) - 1, np.nan)
     tree = cKDTree(xyz)
     for i in range(len(row)):
         members = np.flatnonzero(where == i)
-        chosen = members[np.linspace(0, len(members) - 1, min(len(members), QUERIES)).astype(int)]
+        spaced = np.linspace(0, len(members) - 1, min(len(members), MAX_QUERIES))
+        chosen = members[spaced.astype(int)]
         if len(chosen) >= MIN_QUERIES:
             row[i] = np.median(tree.query(xyz[chosen], k=2)[0][:, 1])
     return row
 
 
-def _intensity(name: str, values: np.ndarray) -> dict:
-    """The quantiles and the histogram of the points' intensity (N,)."""
+def _describe_intensity(name: str, values: np.ndarray) -> dict:
+    """Return the quantiles and the histogram of intensities (N,)."""
     if len(values) == 0:
         return {}
-    count = np.bincount(np.maximum(_bin(values, INTENSITIES), 0), minlength=len(INTENSITIES))
+    count = np.bincount(np.maximum(_find_bins(values, INTENSITIES), 0), minlength=len(INTENSITIES))
     return {f"{name} intensity": np.quantile(values, np.array(QUANTILES) / 100),
             f"{name} intensity histogram": count / len(values)}

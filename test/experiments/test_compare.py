@@ -1,4 +1,4 @@
-"""compare: all detectors on the same frames, what is missing, the figure."""
+"""The verb compare: scores, missing detectors and the figure."""
 
 from __future__ import annotations
 
@@ -62,25 +62,25 @@ def run(tmp_path, *arguments) -> tuple[dict, str]:
     return json.loads(path.read_text()), result.stdout
 
 
-def taken(root, *detectors) -> dict:
-    """The report of detectors: functions of a frame to a detector, or None."""
+def compute_report(root, *detectors) -> dict:
+    """Return the report of detectors; each is a function from a frame to a detector or None."""
     contenders = [Contender(str(i), each) for i, each in enumerate(detectors)]
     report = ComparisonReport(contenders)
     fill(report, open_recording(root), partial(start_comparison, lambda: contenders))
     return report.compute()
 
 
-def saying(say):
-    """What gives a detector for each frame that says what say(frame) gives, Detections."""
-    return lambda frame: lambda scan: DetectionResult(say(frame))
+def make_fake(detect):
+    """Return a function from a frame to a detector that returns detect(frame)."""
+    return lambda frame: lambda scan: DetectionResult(detect(frame))
 
 
-def right(frame, score=0.9) -> Detections:
+def copy_labels(frame, score=0.9) -> Detections:
     truth = frame.truth()
     return Detections.of(truth.boxes, truth.class_ids, score)
 
 
-def test_all_detectors_are_compared_and_what_is_missing_is_listed(bare, weights, tmp_path,
+def test_all_detectors_run_and_missing_ones_are_listed(bare, weights, tmp_path,
                                                                  monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     root, png = crowd_folder(tmp_path / "kitti", 3), tmp_path / "pictures/compare.png"
@@ -129,16 +129,17 @@ def test_candidates_are_compared_in_any_layout(bare, tmp_path):
 def test_perfect_detector_scores_100_and_failing_one_continues(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=3)
 
-    def fails(frame):
+    def fail(frame):
         if frame.name == "000001":
             raise InputError("too dark")
-        return right(frame)
+        return copy_labels(frame)
 
-    def broken(frame):
+    def return_nan(frame):
         return Detections.of(np.vstack([frame.truth().boxes, np.full((1, 7), np.nan)]))
 
-    whole, failing, other, nan = taken(root, saying(right), saying(fails), lambda frame: None,
-                                       saying(broken))["rows"].values()
+    whole, failing, other, nan = compute_report(
+        root, make_fake(copy_labels), make_fake(fail), lambda frame: None,
+        make_fake(return_nan))["rows"].values()
     assert whole["ap"]["Pedestrian"]["3d"]["moderate"] == 100 == whole["mean_ap"]["3d"]
     assert whole["pedestrian_centres"]["operating"]["f1"] == 1 and whole["failed"] == []
     assert (failing["frames"], failing["failed"]) == (2, ["000001: too dark"])
@@ -149,10 +150,10 @@ def test_perfect_detector_scores_100_and_failing_one_continues(tmp_path):
     assert len(nan["failed"]) == 3 and nan["ap"]["Pedestrian"]["3d"]["moderate"] == 100
 
 
-def test_pedestrians_count_from_the_operating_score_on(tmp_path):
+def test_pedestrians_count_from_default_threshold(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=1)
 
-    row, = taken(root, saying(lambda frame: right(frame, 0.2)))["rows"].values()
+    row, = compute_report(root, make_fake(lambda frame: copy_labels(frame, 0.2)))["rows"].values()
     row = row["pedestrian_centres"]
     assert (row["operating"]["tp"], row["best"]["tp"]) == (0, 1)
     assert row["best"]["score"] == pytest.approx(0.2)
@@ -166,29 +167,29 @@ def test_detectors_take_turns(tmp_path):
         for place in range(count):
             assert sorted(order[place] for order in orders) == sorted(2 * items)
     said = []
-    taken(object_folder(tmp_path, walker_label(), count=3),
+    compute_report(object_folder(tmp_path, walker_label(), count=3),
           *(lambda frame, i=i: said.append((frame.name, i)) for i in range(3)))
     first, *rest = (said[i:i + 3] for i in range(0, len(said), 3))
     assert first == rest[0] and len(rest) == 3  # the first frame once more before it counts
     assert [frame[0][1] for frame in rest] == [0, 1, 2]
 
 
-def test_what_cannot_be_read_is_skipped(tmp_path):
+def test_unreadable_frames_are_skipped(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=2)
     write(root / "training/velodyne/000000.bin", b"123")
-    content = taken(root, saying(lambda frame: Detections.none()))
+    content = compute_report(root, make_fake(lambda frame: Detections.none()))
     line, = content["skipped"]
     assert content["frames"] == content["rows"]["0"]["frames"] == 1 and "000000.bin" in line
 
 
-def test_a_class_without_labels_is_left_out_of_the_mean(tmp_path):
+def test_mean_ignores_classes_without_labels(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=1)
-    row, = taken(root, saying(lambda frame: Detections.none()))["rows"].values()
+    row, = compute_report(root, make_fake(lambda frame: Detections.none()))["rows"].values()
     assert row["mean_ap"] == dict.fromkeys(row["mean_ap"], 0.0)
     assert [row["ap"][name]["3d"]["moderate"] for name in SCORED] == [None, 0.0, None]
 
 
-def test_names_in_the_figure_keep_their_distance():
+def test_names_in_figure_do_not_overlap():
     rng = np.random.default_rng(0)
     for count in (1, 2, 5, 20, 60):
         values = rng.choice([rng.uniform(0, 100), 0, 50, 100], count) + rng.normal(0, 2, count)

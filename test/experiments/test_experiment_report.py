@@ -26,7 +26,7 @@ pytestmark = pytest.mark.no_cover  # others run these lines
 # The report
 
 
-def test_skipped_frames_are_counted_by_reason():
+def test_skipped_frames_are_grouped_by_reason():
     records = [{"frame": str(i), "skipped": f"/a/{i}.bin was cut"} for i in range(20)]
     records += [{"frame": "x", "skipped": "no labels"}, {"frame": "y"}]
     first, second = group_skipped_frames(records)
@@ -34,7 +34,7 @@ def test_skipped_frames_are_counted_by_reason():
     assert (second["count"], second["names"]) == (1, ["x"])
 
 
-def test_text_is_escaped(few, tmp_path):
+def test_report_escapes_text(few, tmp_path):
     records = run_experiment(SMALL, open_recording(few), tmp_path / "out")
     page = write_report(tmp_path / "out", SMALL, records, points_table(records),
                         {"folder": "<b>"}).read_text()
@@ -44,7 +44,7 @@ def test_text_is_escaped(few, tmp_path):
     assert "| frame | points |" in markdown
 
 
-def test_cells_of_tables_are_shown_with_their_decimals():
+def test_cells_show_their_decimals():
     assert format_cell(Cell(1.25, 1.0, 2.0, 3.0, 2)) == ("1.25", "[1.00, 2.00]", "3.00")
     assert format_cell(Cell(None)) == ("–", "", "")
     assert format_cell(Cell(0.0, digits=0)) == ("0", "", "")
@@ -53,7 +53,7 @@ def test_cells_of_tables_are_shown_with_their_decimals():
 
 
 @pytest.mark.parametrize("kind", ["svg", "png"])
-def test_figures_are_drawn_the_same_again_also_without_points(kind):
+def test_figures_are_reproducible_with_and_without_points(kind):
     panels = tuple(Panel(str(k), "x", "recall [%]", (
         Line("a", [0, 1], [None, 50.0], [None, 40.0], [None, 60.0]), Line("empty", [], []),
         Line("a, paper", [0.5, 0.5], [0, 100], dashed=True))) for k in range(4))

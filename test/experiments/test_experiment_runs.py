@@ -1,5 +1,5 @@
-"""Laws of a run: however it is spread or stopped, the records are the same, and bad input costs the
-frames that it hits and no others. Every number is in every format of its report."""
+"""Runs of experiments: records do not depend on processes or interruptions, bad frames are skipped,
+and every format of the report has every number."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from experiment_samples import (
     SMALL,
     command,
     count_points,
-    lines_of,
     points_table,
+    read_lines,
     small,
     untimed,
 )
@@ -45,22 +45,22 @@ ROOT = Path(__file__).resolve().parents[2]
 TIMED = {"table_9", "table_9_median"}
 
 
-def break_down(frames, number):
+def raise_bug(frames, number):
     if number == 2:
         raise ZeroDivisionError("a mistake")
     return {"frame": frames[number].name}
 
 
-def not_json(frames, number):
+def measure_nan(frames, number):
     return {"frame": frames[number].name, "value": float("nan")}
 
 
-def end_the_process(frames, number):
+def kill_process(frames, number):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def content(folder):
-    """Name to content of the files that hold no times."""
+def read_untimed_files(folder):
+    """Return name -> content of the files without times."""
     return {path.name: path.read_bytes() for path in sorted(folder.rglob("*"))
             if path.suffix in (".csv", ".png") and path.stem not in TIMED}
 
@@ -68,7 +68,7 @@ def content(folder):
 # However it is spread and stopped
 
 
-def test_a_cluster_of_two_workers_measures_what_one_process_does(crowds, whole, tmp_path):
+def test_dask_cluster_gives_the_same_records(crowds, whole, tmp_path):
     distributed = pytest.importorskip("distributed", reason="needs the extra [distributed]")
     from dask import config
     forked = config.set({"distributed.worker.multiprocessing-method": "forkserver"})
@@ -77,47 +77,47 @@ def test_a_cluster_of_two_workers_measures_what_one_process_does(crowds, whole, 
         address = cluster.scheduler_address
         run_experiment(STM_CPA, open_recording(crowds), tmp_path / "out", dask=address)
         with pytest.raises(ZeroDivisionError):
-            run_experiment(small(break_down), open_recording(crowds), tmp_path / "broken",
+            run_experiment(small(raise_bug), open_recording(crowds), tmp_path / "broken",
                            dask=address)
     assert untimed(tmp_path / "out") == untimed(whole)
 
 
-def test_a_cluster_that_is_not_there_is_named(few, tmp_path, monkeypatch):
+def test_unreachable_scheduler_is_named(few, tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra [distributed]")
     monkeypatch.setattr(scoring_run, "CONNECT_S", 0.2)
     with pytest.raises(InputError, match="cannot reach a Dask scheduler"):
         run_experiment(SMALL, open_recording(few), tmp_path / "out", dask="tcp://127.0.0.1:9")
 
 
-def test_without_distributed_the_extra_is_named(few, tmp_path, monkeypatch):
+def test_missing_distributed_names_the_extra(few, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"lidar_perception\[distributed\]"):
         run_experiment(SMALL, open_recording(few), tmp_path / "out", dask="tcp://127.0.0.1:9")
 
 
-def test_a_killed_run_of_two_processes_goes_on_where_it_was(crowds, whole, tmp_path):
+def test_killed_run_of_two_processes_resumes(crowds, whole, tmp_path):
     out = tmp_path / "out"
     process = subprocess.Popen(
         [sys.executable, "-m", "experiments", "reproduce", "--data", str(crowds),
          "--out", str(out), "--jobs", "2"], cwd=ROOT, start_new_session=True, text=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE)
-    while len(lines_of(out)) < 4:
+    while len(read_lines(out)) < 4:
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.005)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     wait_for_the_end(process.pid)  # its children end by themselves
     assert "Traceback" not in process.communicate()[1]
-    kept = lines_of(out)
+    kept = read_lines(out)
     assert 4 <= len(kept)  # on a busy machine all may be measured before the signal comes
     command("--data", crowds, "--out", out, "--jobs", 1)
     assert untimed(out) == untimed(whole)
-    assert content(out) == content(whole)
-    assert set(kept[:4]) <= set(lines_of(out))  # with their times: they were not measured again
+    assert read_untimed_files(out) == read_untimed_files(whole)
+    assert set(kept[:4]) <= set(read_lines(out))  # with their times: they were not measured again
 
 
 @pytest.mark.parametrize("cut", [1, 2, 40])
-def test_a_cut_last_line_is_dropped_and_its_frame_measured_again(few, tmp_path, cut):
+def test_truncated_last_record_is_measured_again(few, tmp_path, cut):
     expected = run_experiment(SMALL, open_recording(few), tmp_path / "out")
     path = tmp_path / "out" / journal.JOURNAL_NAME
     bytes_before = path.read_bytes()
@@ -126,23 +126,24 @@ def test_a_cut_last_line_is_dropped_and_its_frame_measured_again(few, tmp_path, 
     assert path.read_bytes() == bytes_before
 
 
-def test_what_is_there_is_not_measured_again(few, tmp_path, monkeypatch):
+def test_finished_frames_are_not_measured_again(few, tmp_path, monkeypatch):
     expected = run_experiment(SMALL, open_recording(few), tmp_path / "out", limit=2)
     assert [r["frame"] for r in expected] == ["000000", "000001"]
     asked = []
 
-    def noted(frames, number):
+    def log_measure(frames, number):
         asked.append(number)
         return count_points(frames, number)
 
-    assert run_experiment(small(noted), open_recording(few), tmp_path / "out")[:2] == expected
+    recording, out = open_recording(few), tmp_path / "out"
+    assert run_experiment(small(log_measure), recording, out)[:2] == expected
     assert asked == [2, 3, 4]
-    assert len(run_experiment(small(noted), open_recording(few), tmp_path / "out", limit=1)) == 1
+    assert len(run_experiment(small(log_measure), recording, out, limit=1)) == 1
     assert asked == [2, 3, 4]
-    assert len(lines_of(tmp_path / "out")) == 1 + 4  # the plan, and what was not skipped
+    assert len(read_lines(tmp_path / "out")) == 1 + 4  # the plan, and what was not skipped
 
 
-def test_a_frame_that_was_skipped_is_tried_again(few, tmp_path):
+def test_skipped_frame_is_tried_again(few, tmp_path):
     scan = few / "training/velodyne/000001.bin"
     whole = scan.read_bytes()
     scan.write_bytes(whole[:100])
@@ -157,7 +158,7 @@ def test_a_frame_that_was_skipped_is_tried_again(few, tmp_path):
 # What is in the way
 
 
-def test_another_plan_is_an_error_that_names_what_differs(few, tmp_path):
+def test_other_settings_are_refused_by_name(few, tmp_path):
     out = tmp_path / "out"
     run_experiment(small(limits=(1, 2), deep={"a": 1, "b": 2}), open_recording(few), out)
     before = (out / journal.JOURNAL_NAME).read_bytes()
@@ -172,7 +173,7 @@ def test_another_plan_is_an_error_that_names_what_differs(few, tmp_path):
     assert len(run_experiment(SMALL, open_recording(other), out)) == 4
 
 
-def test_a_folder_of_something_else_is_left_alone(few, tmp_path):
+def test_foreign_folder_is_left_alone(few, tmp_path):
     out = tmp_path / "mine"
     write(out / "letter.txt", "dear")
     write(out / "figures/photo.png", "me")
@@ -187,7 +188,7 @@ def test_a_folder_of_something_else_is_left_alone(few, tmp_path):
         run_experiment(SMALL, open_recording(few), out / "letter.txt/deeper")
 
 
-def test_force_begins_anew_and_leaves_no_old_table_and_what_is_not_the_runs(whole, few, tmp_path):
+def test_force_removes_files_of_the_old_run_only(whole, few, tmp_path):
     out = shutil.copytree(whole, tmp_path / "out")
     theirs = {write(out / "tables/mine.csv", "me"), write(out / "figures/photo.png", "me")}
     records = run_experiment(SMALL, open_recording(few), out, force=True)
@@ -197,50 +198,50 @@ def test_force_begins_anew_and_leaves_no_old_table_and_what_is_not_the_runs(whol
 
 
 @pytest.mark.parametrize("first", ["", "{", "[]", '{"frame": "000000"}'])
-def test_a_journal_without_a_plan_is_not_gone_on_with(few, tmp_path, first):
+def test_journal_without_plan_is_not_resumed(few, tmp_path, first):
     write(tmp_path / "out" / journal.JOURNAL_NAME, first + "\n")
     with pytest.raises(InputError, match=r"cannot read .*--force"):
         run_experiment(SMALL, open_recording(few), tmp_path / "out")
     assert len(run_experiment(SMALL, open_recording(few), tmp_path / "out", force=True)) == 5
 
 
-def test_two_runs_do_not_write_one_folder(few, tmp_path):
+def test_folder_is_locked_by_a_run(few, tmp_path):
     with (journal.open_journal(tmp_path / "out", {}) as _,
           pytest.raises(InputError, match="another process")):
         run_experiment(SMALL, open_recording(few), tmp_path / "out", force=True)
 
 
-def test_a_full_disk_is_one_line_and_the_rest_goes_on_later(few, tmp_path, monkeypatch):
-    def full(self):
+def test_full_disk_is_one_line_and_run_resumes(few, tmp_path, monkeypatch):
+    def raise_disk_full(self):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
         patch.setattr(journal, "SYNC_S", -1.0)
-        patch.setattr(journal.Journal, "sync", full)
+        patch.setattr(journal.Journal, "sync", raise_disk_full)
         with pytest.raises(InputError, match=r"No space left.*the same command resumes"):
             run_experiment(SMALL, open_recording(few), tmp_path / "out")
     assert len(run_experiment(SMALL, open_recording(few), tmp_path / "out")) == 5
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_a_mistake_in_an_experiment_is_not_a_skipped_frame(few, tmp_path, jobs, capfd):
+def test_bug_in_experiment_is_not_a_skipped_frame(few, tmp_path, jobs, capfd):
     if jobs > 1:
         forkserver._forkserver._stop()  # processes say it where their server was started
     with pytest.raises((ZeroDivisionError, InputError)) as error:
-        run_experiment(small(break_down), open_recording(few), tmp_path / "out", jobs=jobs)
+        run_experiment(small(raise_bug), open_recording(few), tmp_path / "out", jobs=jobs)
     said = capfd.readouterr().err + "".join(getattr(error.value, "__notes__", []))
     assert "while frame 000002 was measured" in said
-    assert '"000002"' not in "".join(lines_of(tmp_path / "out"))
+    assert '"000002"' not in "".join(read_lines(tmp_path / "out"))
 
 
-def test_a_record_that_is_no_json_is_a_mistake(few, tmp_path):
+def test_record_must_be_json(few, tmp_path):
     with pytest.raises(ValueError, match="JSON"):
-        run_experiment(small(not_json), open_recording(few), tmp_path / "out")
+        run_experiment(small(measure_nan), open_recording(few), tmp_path / "out")
 
 
-def test_a_process_that_is_killed_ends_the_run_with_a_reason(few, tmp_path):
+def test_killed_worker_ends_run_with_reason(few, tmp_path):
     with pytest.raises(InputError, match=r"measured frames.*out of memory: try fewer --jobs"):
-        run_experiment(small(end_the_process), open_recording(few), tmp_path / "out", jobs=2)
+        run_experiment(small(kill_process), open_recording(few), tmp_path / "out", jobs=2)
 
 
 # Broken frames
@@ -260,7 +261,7 @@ BROKEN = {
 }
 
 
-def test_broken_frames_are_skipped_by_name_and_the_others_are_as_before(crowds, whole, tmp_path):
+def test_broken_frames_are_skipped_and_others_unchanged(crowds, whole, tmp_path):
     root = tmp_path / "kitti"
     shutil.copytree(crowds, root)
     for name, change in BROKEN.items():
@@ -285,7 +286,7 @@ def test_broken_frames_are_skipped_by_name_and_the_others_are_as_before(crowds, 
     assert sum("skipped" not in r for r in records.values()) == COUNT - len(BROKEN) - 1
 
 
-def test_a_split_leaves_out_all_else(few, tmp_path):
+def test_split_selects_frames(few, tmp_path):
     (few / "training/velodyne/000004.bin").unlink()
     split = write(tmp_path / "split.txt", "000002\n000000\n")
     whole = open_recording(few)
@@ -295,7 +296,7 @@ def test_a_split_leaves_out_all_else(few, tmp_path):
     assert [r["frame"] for r in run_experiment(SMALL, whole, tmp_path / "all")][-1] == "000004"
 
 
-def test_a_folder_without_scans_or_pedestrians_is_an_error(tmp_path):
+def test_folder_without_scans_or_pedestrians_is_refused(tmp_path):
     for argument, words in ((tmp_path / "none", "does not exist"),
                             (tmp_path, "is not a recording in a supported format")):
         with pytest.raises(InputError, match=words):
@@ -310,7 +311,7 @@ def test_a_folder_without_scans_or_pedestrians_is_an_error(tmp_path):
 # The report and the summary
 
 
-def test_every_table_and_figure_is_in_every_format(whole):
+def test_every_format_has_every_table_and_figure(whole):
     report = json.loads((whole / "report.json").read_text())
     page = html.unescape((whole / "report.html").read_text())
     markdown = (whole / "report.md").read_text()
@@ -343,7 +344,7 @@ def test_every_table_and_figure_is_in_every_format(whole):
                                                              *report_files.list_report_files(whole)}
 
 
-def test_the_page_needs_no_other_file_and_says_what_was_run(whole, crowds):
+def test_page_is_self_contained_and_describes_the_run(whole, crowds):
     page = (whole / "report.html").read_text()
     assert not re.findall(r'(?:src|href|srcset)="(?!data:|#)', page) and "<script" not in page
     assert str(crowds) in page and "11 measured, 1 skipped" in page and "lidar_perception" in page
@@ -353,7 +354,7 @@ def test_the_page_needs_no_other_file_and_says_what_was_run(whole, crowds):
     assert [r["frame"] for r in report["skipped_frames"]] == ["000011"]
 
 
-def test_the_summary_shows_the_scores_beside_the_papers(whole):
+def test_summary_shows_scores_next_to_the_papers(whole):
     text = (whole.parent / "said").read_text()
     report = json.loads((whole / "report.json").read_text())
     row = next(t for s in report["sections"] for t in s["tables"]

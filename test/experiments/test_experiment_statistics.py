@@ -31,7 +31,7 @@ def hits(frames, rate, rng):
 
 
 @given(seeds, st.integers(30, 300), st.floats(0.2, 0.8))
-def test_the_interval_holds_the_value(seed, frames, rate):
+def test_interval_contains_the_value(seed, frames, rate):
     rng = np.random.default_rng(seed)
     counts = rng.poisson(3, (frames, 2)) * [rate, 1 - rate]
     value, low, high = bootstrap(counts, share)
@@ -40,7 +40,7 @@ def test_the_interval_holds_the_value(seed, frames, rate):
 
 
 @given(seeds, st.floats(0.2, 0.8))
-def test_the_interval_of_a_share_is_that_of_the_binomial_distribution(seed, rate):
+def test_interval_of_share_agrees_with_binomial(seed, rate):
     counts = hits(1000, rate, np.random.default_rng(seed))
     (value,), (low,), (high,) = bootstrap(counts, share)
     expected = 2 * 1.96 * np.sqrt(value * (1 - value) / 1000)
@@ -54,7 +54,7 @@ def test_four_times_the_frames_halve_the_interval():
     assert wide / narrow == pytest.approx(2.0, rel=0.1)
 
 
-def test_the_interval_covers_the_truth_as_often_as_it_says():
+def test_interval_covers_truth_at_its_level():
     rng = np.random.default_rng(0)
     params = BootstrapParams(replicates=400)
     inside = 0
@@ -81,19 +81,19 @@ def test_weights_are_draws_with_replacement():
 
 
 @pytest.mark.parametrize("counts", [np.full((50, 2), 3), [[7, 2]], [[0, 0], [4, 4], [0, 0]]])
-def test_frames_that_agree_have_no_width(counts):
+def test_equal_frames_give_zero_width(counts):
     value, low, high = bootstrap(np.array(counts), share)
     assert value == low == high == pytest.approx(np.sum(counts, axis=0)[0] / np.sum(counts))
 
 
 @pytest.mark.parametrize("counts", [np.zeros((0, 2)), np.zeros((8, 2))])
-def test_without_cases_there_is_no_value(counts):
+def test_no_cases_give_no_value(counts):
     assert np.isnan(bootstrap(counts, share)).all()
     (cell,) = make_cells(bootstrap(counts, share))
     assert (cell.value, cell.low, cell.high, cell.paper) == (None, None, None, None)
 
 
-def test_the_same_seed_gives_the_same_interval_and_blocks_do_not_matter(monkeypatch):
+def test_interval_depends_on_seed_and_not_on_block_size(monkeypatch):
     counts = np.random.default_rng(1).poisson(3, (40, 2))
     first = bootstrap(counts, share)
     np.testing.assert_array_equal(first, bootstrap(counts, share))
@@ -102,7 +102,7 @@ def test_the_same_seed_gives_the_same_interval_and_blocks_do_not_matter(monkeypa
     np.testing.assert_array_equal(first, bootstrap(counts, share))
 
 
-def test_figures_of_any_shape_are_those_of_their_columns():
+def test_values_of_any_shape_equal_their_columns():
     counts = np.random.default_rng(2).poisson(2, (60, 3, 4))
     together = bootstrap(counts, lambda sums: compute_rates(*np.moveaxis(sums, -2, 0)))
     assert together.shape == (3, 4, 3)
@@ -112,7 +112,7 @@ def test_figures_of_any_shape_are_those_of_their_columns():
 
 
 @given(st.integers(0, 50), st.integers(0, 50), st.integers(0, 50))
-def test_rates_are_recall_precision_and_their_harmonic_mean(tp, fp, fn):
+def test_rates_are_recall_precision_and_f1(tp, fp, fn):
     recall, precision, f1 = nan_to_none(compute_rates(np.array(tp), np.array(fp), np.array(fn)))
     assert (recall is None) == (tp + fn == 0) and (precision is None) == (tp + fp == 0)
     assert (f1 is None) == (tp + fp + fn == 0)
@@ -122,7 +122,7 @@ def test_rates_are_recall_precision_and_their_harmonic_mean(tp, fp, fn):
         assert f1 == 0
 
 
-def test_cells_carry_the_papers_figures_and_decimals():
+def test_cells_have_paper_values_and_decimals():
     estimates = np.array([[1.0, np.nan], [0.5, np.nan], [2.0, np.nan]])
     first, second = make_cells(estimates, (3.0, None), (1, 2))
     assert (first.value, first.low, first.high, first.paper, first.digits) == (1, 0.5, 2, 3, 1)
@@ -131,6 +131,6 @@ def test_cells_carry_the_papers_figures_and_decimals():
         make_cells(estimates, (3.0,))
 
 
-def test_stacked_rows_keep_their_shape_without_frames():
+def test_stacked_counts_keep_shape_without_frames():
     assert stack_counts([], 2, 3).shape == (0, 2, 3)
     assert stack_counts([[1, 2]], 2).tolist() == [[1, 2]]

@@ -17,21 +17,21 @@ from experiments.realism import command
 from experiments.realism.compare import (
     MAX_SCANS,
     MIN_SAMPLES,
-    evenly,
-    factor_off,
-    measured_scans,
-    median_interval,
-    ratio,
-    side_by_side,
+    compare_scans,
+    compute_factor,
+    compute_median_interval,
+    compute_ratio,
+    measure_scans,
+    select_frames,
 )
 from experiments.realism.report import draw_realism, print_realism
 from experiments.realism.scan_statistics import (
     CLASSES,
     CURVES,
+    compute_object_rows,
+    compute_scan_rows,
+    compute_square_degrees,
     is_whole,
-    object_rows,
-    scan_rows,
-    square_degrees,
 )
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.data.frame import Frame
@@ -80,7 +80,7 @@ def with_scan(frame: Frame, scan: PointCloud) -> Frame:
 
 def rows_of(frame: Frame) -> dict:
     """The rows of its objects."""
-    return object_rows(frame.load(), frame.truth(), frame.camera())
+    return compute_object_rows(frame.load(), frame.truth(), frame.camera())
 
 
 def changed(change, count: int = SCANS) -> list[Frame]:
@@ -91,7 +91,7 @@ def changed(change, count: int = SCANS) -> list[Frame]:
 
 @cache
 def street():
-    return measured_scans(map(recorded, range(SCANS)), PAPER)
+    return measure_scans(map(recorded, range(SCANS)), PAPER)
 
 
 def judged(content: dict, names=CURVES) -> list[dict]:
@@ -99,29 +99,29 @@ def judged(content: dict, names=CURVES) -> list[dict]:
             if b["within"] is not None]
 
 
-def test_a_recording_is_as_real_as_itself():
-    content = side_by_side(street(), street())
+def test_recording_agrees_with_itself():
+    content = compare_scans(street(), street())
     assert content["within"] == content["judged"] == len(judged(content)) > 100
-    assert all(b["ratio"] == 1.0 and factor_off(b) == 1.0 for b in judged(content))
+    assert all(b["ratio"] == 1.0 and compute_factor(b) == 1.0 for b in judged(content))
     assert all(content["curves"][name]["judged"] for name in CURVES
                if "histogram" not in name and name not in FACES)
 
 
-def test_the_ground_is_looked_for_below_the_sensor_of_the_recording():
+def test_ground_is_found_below_a_low_sensor():
     up = np.array([0, 0, SENSOR_HEIGHT - 0.7], np.float32)
     lower = []
     for frame in map(recorded, range(SCANS)):
         scan = frame.load()
         lower.append(Frame.of(frame.name, replace(scan, xyz=scan.xyz + up), sensor_height=0.7))
-    measured = measured_scans(lower, PAPER)
+    measured = measure_scans(lower, PAPER)
     for curve in ("clusters", "person clusters"):
         np.testing.assert_array_equal(measured.rows[curve], street().rows[curve])
 
 
-def test_half_the_points_are_found_by_the_points_and_not_by_the_heights():
+def test_half_the_points_change_counts_and_not_sizes():
     def half(frame, rng):
         return frame.take(np.flatnonzero(rng.random(len(frame)) < 0.5))
-    content = side_by_side(street(), measured_scans(changed(half), PAPER))
+    content = compare_scans(street(), measure_scans(changed(half), PAPER))
     for name in COUNTS:
         bins = [b for b in judged(content, [name]) if b["real"]["median"] >= 100]
         assert all(b["ratio"] == pytest.approx(0.5, abs=0.1) for b in bins), name
@@ -130,8 +130,8 @@ def test_half_the_points_are_found_by_the_points_and_not_by_the_heights():
     assert all(b["within"] for b in judged(content, LIGHT))
 
 
-def test_a_weaker_light_is_found_by_the_intensities_alone():
-    content = side_by_side(street(), measured_scans(
+def test_half_the_intensity_changes_intensities_only():
+    content = compare_scans(street(), measure_scans(
         changed(lambda frame, rng: replace(frame, intensity=frame.intensity * 0.5)), PAPER))
     for name, curve in content["curves"].items():
         if name not in LIGHT:
@@ -140,8 +140,8 @@ def test_a_weaker_light_is_found_by_the_intensities_alone():
             assert all(b["ratio"] == pytest.approx(0.5, abs=0.03) for b in curve["bins"]), name
 
 
-def test_the_order_of_the_points_does_not_matter():
-    content = side_by_side(street(), measured_scans(
+def test_order_of_points_does_not_matter():
+    content = compare_scans(street(), measure_scans(
         changed(lambda frame, rng: frame.take(rng.permutation(len(frame)))), PAPER))
     for name, curve in content["curves"].items():
         for b in curve["bins"]:
@@ -150,7 +150,7 @@ def test_the_order_of_the_points_does_not_matter():
 
 def test_counts_add_up():
     one = recorded(0)
-    rows = {name: row[0] for name, row in scan_rows(one.load()).items()}
+    rows = {name: row[0] for name, row in compute_scan_rows(one.load()).items()}
     assert rows["points"].sum() == rows["scan points"][0] == len(one.load())
     assert ((rows["ground share"] >= 0) & (rows["ground share"] <= 1)
             | np.isnan(rows["ground share"])).all()
@@ -161,7 +161,7 @@ def test_counts_add_up():
 
 
 def test_bins_with_few_real_samples_are_not_judged():
-    content = side_by_side(measured_scans(map(recorded, range(MIN_SAMPLES - 1)), PAPER), street())
+    content = compare_scans(measure_scans(map(recorded, range(MIN_SAMPLES - 1)), PAPER), street())
     assert all(content["curves"][name]["judged"] == 0 for name in (*COUNTS, *EXTENTS))
     for name, curve in content["curves"].items():
         for b in curve["bins"]:
@@ -169,36 +169,36 @@ def test_bins_with_few_real_samples_are_not_judged():
             assert (b["within"] is None) == few, (name, b)
 
 
-def test_what_is_missing_on_the_simulated_side_is_wrong():
-    content = side_by_side(street(), measured_scans([], PAPER))
+def test_missing_simulated_samples_are_wrong():
+    content = compare_scans(street(), measure_scans([], PAPER))
     assert content["within"] == 0
-    assert content["judged"] == side_by_side(street(), street())["judged"]
+    assert content["judged"] == compare_scans(street(), street())["judged"]
 
 
-def test_nothing_is_compared_with_nothing():
+def test_empty_scans_are_not_judged():
     none = PointCloud(np.zeros((0, 3), np.float32))
     empty = Frame.of("0", none, GroundTruth.of([], []), CALIBRATION)
     for scans in ([], [empty], [Frame.of("0", none, None, CALIBRATION)]):
-        measured = measured_scans(scans, PAPER)
-        content = side_by_side(measured, measured)
+        measured = measure_scans(scans, PAPER)
+        content = compare_scans(measured, measured)
         assert (content["judged"], content["share"]) == (0, None)
         print_realism(content, Console(file=StringIO()))
 
 
-def test_scans_without_intensity_or_camera_have_the_other_curves():
+def test_scans_without_intensity_have_the_other_curves():
     bare = [Frame.of(r.name, replace(r.load(), intensity=None), r.truth())
             for r in map(recorded, range(2))]
-    measured = measured_scans(bare, replace(PAPER, view=replace(PAPER.view, enabled=False)))
+    measured = measure_scans(bare, replace(PAPER, view=replace(PAPER.view, enabled=False)))
     assert all((len(rows) == 0) == (name in LIGHT) for name, rows in measured.rows.items()
                if not name.startswith(("stage", "final")) and name not in FACES)
 
 
-def test_a_scan_cropped_to_the_view_counts_for_its_objects_only():
+def test_cropped_scan_counts_for_its_objects_only():
     whole = recorded(0)
     seen = np.flatnonzero(whole.camera().in_view(whole.load().xyz))
     cropped = with_scan(whole, whole.load().take(seen))
     assert is_whole(whole.load()) and not is_whole(cropped.load())
-    measured = measured_scans([cropped], PAPER)
+    measured = measure_scans([cropped], PAPER)
     assert (measured.scans, measured.whole_scans) == (1, 0)
     assert all(not measured.rows[name] for name in ("points", "clusters", "ground intensity"))
     expected = rows_of(whole)
@@ -206,13 +206,13 @@ def test_a_scan_cropped_to_the_view_counts_for_its_objects_only():
                for name, rows in rows_of(cropped).items())
 
 
-def test_objects_at_the_border_of_the_image_do_not_count():
+def test_objects_at_image_border_do_not_count():
     one = recorded(0)
     border = one.truth().boxes[:1].copy()
     while one.camera().in_view(border[:, :3]).all():
         border[0, 1] += 0.1
     border[0, 1] -= 0.2  # the centre is seen, a half is not
-    assert object_rows(one.load(), GroundTruth.of(border, [0]), one.camera()) == {}
+    assert compute_object_rows(one.load(), GroundTruth.of(border, [0]), one.camera()) == {}
 
 
 @pytest.mark.parametrize("level", [1, 2, 3])
@@ -220,7 +220,7 @@ def test_occluded_objects_count_for_all_points_only(level):
     one = recorded(0)
     truth = one.truth()
     truth = replace(truth, extras=tuple({"occluded": level} for _ in truth.extras))
-    found = set(object_rows(one.load(), truth, one.camera()))
+    found = set(compute_object_rows(one.load(), truth, one.camera()))
     assert found == {name for name in rows_of(one)
                      if name.endswith("points of all") or "intensity" in name}
 
@@ -228,7 +228,7 @@ def test_occluded_objects_count_for_all_points_only(level):
 @pytest.mark.parametrize("face, sensor", [("behind", (-15, 1, 0)), ("the front", (12, -2, 1)),
                                           ("the side", (1, 14, 0)), ("the side", (-2, -9, 0))])
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
-def test_points_behind_a_face_of_a_car_are_so_far_behind_it(face, sensor, yaw):
+def test_depth_behind_car_face_is_measured(face, sensor, yaw):
     size, depth = np.array([4.0, 1.8, 1.5]), 0.07
     axis, half = int(face == "the side"), size[int(face == "the side")] / 2
     own = np.random.default_rng(2).uniform(-0.5, 0.5, (60, 3)) * size
@@ -240,50 +240,52 @@ def test_points_behind_a_face_of_a_car_are_so_far_behind_it(face, sensor, yaw):
 
     def found(points, truth=box):
         scan = PointCloud((centre + points @ turn.T).astype(np.float32), None)
-        return {name: row for name, row in object_rows(scan, truth, None).items()
+        return {name: row for name, row in compute_object_rows(scan, truth, None).items()
                 if name.startswith("Car from")}
     assert set(found(own)) == {f"Car from {face}"}
     assert found(own)[f"Car from {face}"][0] == pytest.approx([depth] * 3, abs=1e-4)
     assert found(own[:5]) == {} == found(own, replace(box, extras=({"occluded": 1},)))
 
 
-def test_square_degrees():
+def test_square_degrees_of_upright_and_rotated_boxes():
     upright = np.array([20.0, 0, 0, 0.5, 0.5, 1.7, 0])
-    assert square_degrees(upright) == pytest.approx(np.degrees(0.5 / 20) * np.degrees(1.7 / 20),
-                                                    rel=0.01)
+    expected = np.degrees(0.5 / 20) * np.degrees(1.7 / 20)
+    assert compute_square_degrees(upright) == pytest.approx(expected, rel=0.01)
     turned = np.array([0, 20.0, 0, 0.5, 0.5, 1.7, np.pi / 2])
-    assert square_degrees(turned) == pytest.approx(square_degrees(upright))
+    assert compute_square_degrees(turned) == pytest.approx(compute_square_degrees(upright))
     side, behind = (np.array([20.0, 0, 0, 4, 2, 1.5, yaw]) for yaw in (np.pi / 2, 0))
-    assert square_degrees(side) == pytest.approx(2 * square_degrees(behind), rel=0.01)
+    assert compute_square_degrees(side) == pytest.approx(2 * compute_square_degrees(behind),
+                                                         rel=0.01)
 
 
-def test_ratio():
-    assert ratio(3.0, 2.0) == 1.5 and ratio(0.0, 0.0) == 1.0
-    assert ratio(1.0, 0.0) is None and ratio(None, 1.0) is None and ratio(1.0, None) is None
+def test_ratio_is_none_for_missing_values():
+    assert compute_ratio(3.0, 2.0) == 1.5 and compute_ratio(0.0, 0.0) == 1.0
+    for simulated, real in ((1.0, 0.0), (None, 1.0), (1.0, None)):
+        assert compute_ratio(simulated, real) is None
 
 
-def test_the_interval_holds_the_median():
+def test_median_interval_covers_the_median():
     rng = np.random.default_rng(0)
     for count, least in ((5, 0.93), (27, 0.95), (200, 0.95)):
-        limits = [median_interval(rng.normal(size=count)) for _ in range(2000)]
+        limits = [compute_median_interval(rng.normal(size=count)) for _ in range(2000)]
         assert np.mean([low <= 0 <= high for low, high in limits]) > least - 0.02
-    assert median_interval(np.array([3.0])) == [3.0, 3.0]
+    assert compute_median_interval(np.array([3.0])) == [3.0, 3.0]
 
 
-def test_what_lies_among_uncertain_real_samples_is_plausible():
+def test_median_within_real_interval_is_plausible():
     def thinned(shares):
-        return measured_scans([with_scan(r, r.load().take(np.flatnonzero(
+        return measure_scans([with_scan(r, r.load().take(np.flatnonzero(
             np.random.default_rng(100).random(len(r.load())) < share)))
             for r, share in zip(map(recorded, range(SCANS)), shares)], PAPER)
-    content = side_by_side(thinned(np.linspace(0.3, 1, SCANS)), thinned([0.9] * SCANS))
+    content = compare_scans(thinned(np.linspace(0.3, 1, SCANS)), thinned([0.9] * SCANS))
     points = judged(content, ["scan points", "Car points"])
     assert not any(b["within"] for b in points) and all(b["plausible"] for b in points)
     assert content["within"] < content["plausible"] <= content["judged"]
     assert all(b["plausible"] for b in judged(content) if b["within"])
 
 
-def test_content_survives_json_and_is_shown(tmp_path):
-    content = side_by_side(street(), measured_scans(map(recorded, range(3)), PAPER))
+def test_content_survives_json_and_is_printed(tmp_path):
+    content = compare_scans(street(), measure_scans(map(recorded, range(3)), PAPER))
     again = json.loads(json.dumps(content, allow_nan=False))
     assert again == content
     shown = StringIO()
@@ -291,7 +293,7 @@ def test_content_survives_json_and_is_shown(tmp_path):
     assert f"{content['within']} of {content['judged']} bins" in shown.getvalue()
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot write"):
-        draw_realism(tmp_path / "file/no.png", side_by_side(street(), measured_scans([], PAPER)))
+        draw_realism(tmp_path / "file/no.png", compare_scans(street(), measure_scans([], PAPER)))
 
 
 def tracking_folder(root):
@@ -304,7 +306,7 @@ def tracking_folder(root):
 @pytest.mark.parametrize("make", [lambda root: object_folder(root, walker_label(), 1),
                                   tracking_folder])
 def test_object_and_tracking_folders_are_read(tmp_path, make):
-    measured = measured_scans(evenly(open_recording(make(tmp_path))), PAPER)
+    measured = measure_scans(select_frames(open_recording(make(tmp_path))), PAPER)
     assert measured.objects == {"Car": 0, "Pedestrian": 1, "Cyclist": 0}
     assert (measured.scans, measured.whole_scans, measured.skipped) == (1, 1, [])
 
@@ -314,31 +316,31 @@ def test_folders_without_labels_are_refused(tmp_path):
     for label in tmp_path.rglob("label_2/*.txt"):
         label.unlink()
     with pytest.raises(InputError, match="no labels"):
-        evenly(open_recording(tmp_path))
+        select_frames(open_recording(tmp_path))
 
 
 def test_broken_scans_are_skipped_and_counted(tmp_path):
     scans = sorted(object_folder(tmp_path, walker_label(), 3).rglob("velodyne/*.bin"))
     write(scans[1], b"cut")
-    measured = measured_scans(evenly(open_recording(tmp_path)), PAPER)
+    measured = measure_scans(select_frames(open_recording(tmp_path)), PAPER)
     assert measured.scans == 2 and len(measured.skipped) == 1
-    assert side_by_side(measured, measured)["real"]["skipped"] == measured.skipped
+    assert compare_scans(measured, measured)["real"]["skipped"] == measured.skipped
     for scan in scans:
         write(scan, b"cut")
     with pytest.raises(InputError, match=r"none of 3 scans can be read: .*000000.bin"):
-        measured_scans(evenly(open_recording(tmp_path)), PAPER)
+        measure_scans(select_frames(open_recording(tmp_path)), PAPER)
 
 
-def test_of_a_large_folder_an_even_choice_is_compared(tmp_path):
+def test_frames_of_large_folder_are_evenly_spaced(tmp_path):
     recording = open_recording(object_folder(tmp_path, walker_label(), 1))
     many = [replace(recording.frames[0], name=str(i)) for i in range(3 * MAX_SCANS)]
-    chosen = evenly(replace(recording, frames=many))
+    chosen = select_frames(replace(recording, frames=many))
     numbers = [int(f.name) for f in chosen]
     assert len(numbers) == MAX_SCANS
     assert (numbers[0], numbers[-1]) == (0, len(many) - 1) and set(np.diff(numbers)) <= {3, 4}
 
 
-def test_the_command_compares(tmp_path, monkeypatch):
+def test_command_writes_json_and_picture(tmp_path, monkeypatch):
     import matplotlib.pyplot as plt
 
     def few_drawn(path, content):
@@ -360,7 +362,7 @@ def test_the_command_compares(tmp_path, monkeypatch):
     assert content["real"]["scans"] == content["simulated"]["scans"] == 1
 
 
-def test_the_sensor_that_is_asked_for_is_compared(tmp_path):
+def test_command_simulates_the_given_sensor(tmp_path):
     root, found = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "realism.json"
     result = CliRunner().invoke(command.realism, [
         str(root), "--frames", "1", "--json", str(found), "--sensor", "generic:4,-12,0,2,10"],
@@ -370,9 +372,9 @@ def test_the_sensor_that_is_asked_for_is_compared(tmp_path):
     assert 100 < sum(b["simulated"]["median"] for b in bins) <= 4 * 180
 
 
-def test_real_scans_are_as_real_as_themselves(data):
+def test_real_scans_agree_with_themselves(data):
     scans = [r for r in open_recording(data / "kitti_object") if is_whole(r.load())][:2]
-    first, second = (measured_scans(scans, PAPER) for _ in range(2))
-    content = side_by_side(first, second)
+    first, second = (measure_scans(scans, PAPER) for _ in range(2))
+    content = compare_scans(first, second)
     assert all(b["ratio"] in (1.0, None) for c in content["curves"].values() for b in c["bins"])
     assert first.whole_scans == 2

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.realism.roughness import MIN_CELLS, roughness, scatter_of_cells
+from experiments.realism.roughness import MIN_CELLS, compute_roughness, measure_cell_scatter
 
 LIMITS = np.array([0.0, 5.0, 15.0, np.inf])
 
@@ -15,46 +15,46 @@ def plane(seed, count=8000, slopes=(0.0, 0.0), noise=0.0):
 
 
 @pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.1, -0.05)])
-def test_a_plane_is_smooth_however_it_leans(slopes):
-    middle, scatter = scatter_of_cells(plane(0, slopes=slopes))
+def test_plane_is_smooth_at_any_slope(slopes):
+    middle, scatter = measure_cell_scatter(plane(0, slopes=slopes))
     assert len(middle) > 400 and scatter.max() < 1e-4
 
 
-def test_scatter_is_the_noise_less_what_the_planes_take():
-    _, scatter = scatter_of_cells(plane(1, 40_000, (0.05, 0.0), 0.03))
+def test_scatter_equals_noise_of_the_points():
+    _, scatter = measure_cell_scatter(plane(1, 40_000, (0.05, 0.0), 0.03))
     assert np.sqrt((scatter ** 2).mean()) == pytest.approx(0.03, rel=0.04)
 
 
-def test_a_beam_s_line_of_points_has_a_plane():
+def test_line_of_points_has_a_plane():
     y = np.linspace(-10, 10, 1000)
     line = np.column_stack([np.full(1000, 8.3), y, 0.02 * y])
-    assert scatter_of_cells(line)[1].max() < 1e-3
+    assert measure_cell_scatter(line)[1].max() < 1e-3
 
 
-def test_a_cell_with_something_on_it_is_no_ground_and_a_few_points_above_do_not_count():
+def test_cells_with_objects_are_not_ground():
     ground = plane(2)
     post = np.column_stack([np.full(200, 4.5), np.full(200, 4.5), np.linspace(-1.7, 0.3, 200)])
     few = np.column_stack([np.full(2, -4.5), np.full(2, 4.5), [0.5, 1.0]])
-    alone, _ = scatter_of_cells(ground)
-    middle, scatter = scatter_of_cells(np.concatenate([ground, post, few]))
+    alone, _ = measure_cell_scatter(ground)
+    middle, scatter = measure_cell_scatter(np.concatenate([ground, post, few]))
     assert len(middle) == len(alone) - 1 and scatter.max() < 1e-4
 
 
-def test_order_and_place_of_the_origin_of_heights_make_no_difference():
+def test_order_and_height_offset_do_not_matter():
     xyz = plane(3, noise=0.02)
-    expected = roughness(xyz, LIMITS)
+    expected = compute_roughness(xyz, LIMITS)
     shuffled = np.random.default_rng(0).permutation(xyz) + [0.0, 0.0, 5.0]
-    np.testing.assert_allclose(roughness(shuffled, LIMITS), expected, atol=1e-9)
+    np.testing.assert_allclose(compute_roughness(shuffled, LIMITS), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("count", [0, 1, 7])
 def test_too_few_points_have_no_roughness(count):
-    assert np.isnan(roughness(np.zeros((count, 3), np.float32), LIMITS)).all()
-    assert len(scatter_of_cells(np.zeros((count, 3)))[0]) == 0
+    assert np.isnan(compute_roughness(np.zeros((count, 3), np.float32), LIMITS)).all()
+    assert len(measure_cell_scatter(np.zeros((count, 3)))[0]) == 0
 
 
-def test_a_range_needs_some_cells():
+def test_range_bin_needs_enough_cells():
     few = plane(4)
     few = few[np.hypot(few[:, 0], few[:, 1]) < 5]
-    row = roughness(few, np.array([0.0, 5.0, 15.0]))
+    row = compute_roughness(few, np.array([0.0, 5.0, 15.0]))
     assert MIN_CELLS < 60 and row[0] < 1e-4 and np.isnan(row[1])

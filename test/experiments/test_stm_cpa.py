@@ -1,4 +1,4 @@
-"""Laws of the experiment of paper A: its counts are those of the pipeline, and add up."""
+"""The STM-CPA experiment: its counts agree with the pipeline, and add up."""
 
 from __future__ import annotations
 
@@ -66,22 +66,22 @@ def measured(records):
 
 @pytest.fixture(scope="module")
 def refined(kitti):
-    """(labelled, segmented, seed, candidates of the paper) of each frame with pedestrians."""
+    """Labelled frame, segments, seed and candidates of each frame with pedestrians."""
     found = []
     for frame in open_recording(kitti).frames[:-1]:
         labelled = load_labelled_frame(frame)
         segmented = segment_cloud(labelled.cloud, labelled.camera, PAPER)
         seed = make_nearest_seed(segmented, labelled)
-        found.append((labelled, segmented, seed, of(segmented, seed, PAPER)))
+        found.append((labelled, segmented, seed, refine(segmented, seed, PAPER)))
     return found
 
 
-def of(segmented, seed, params):
+def refine(segmented, seed, params):
     return refine_clusters(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed, params)
 
 
-def total(measured, *keys):
-    """Sum over the frames of what lies under keys in their records."""
+def add_up(measured, *keys):
+    """Sum record[key][key]... over the records."""
     values = measured
     for key in keys:
         values = [value[key] for value in values]
@@ -92,20 +92,20 @@ def untimed(record):
     return {key: value for key, value in record.items() if key != "ms"}
 
 
-def test_there_is_something_to_count(measured):
+def test_sample_has_hits_and_misses(measured):
     for stage in STAGES:
-        counts = {k: total(measured, "stages", stage, k).sum() for k in ("tp", "fp", "fn")}
+        counts = {k: add_up(measured, "stages", stage, k).sum() for k in ("tp", "fp", "fn")}
         assert min(counts.values()) > 0 or (stage == "stage1" and counts["fn"] == 0)
-    assert (total(measured, "pedestrians")[:3] > 0).all()
+    assert (add_up(measured, "pedestrians")[:3] > 0).all()
 
 
-def test_frames_come_in_order_and_the_one_without_pedestrians_is_skipped(kitti, records):
+def test_frames_are_in_order_and_empty_one_is_skipped(kitti, records):
     assert [r["frame"] for r in records] == [frame.name for frame in open_recording(kitti)]
     assert ["skipped" in r for r in records] == [False] * (COUNT - 1) + [True]
     assert "no Pedestrian" in records[-1]["skipped"]
 
 
-def test_hits_and_misses_are_the_truth_in_every_part_of_a_record(kitti, measured):
+def test_hits_and_misses_add_up_to_labels(kitti, measured):
     for frame, record in zip(open_recording(kitti).frames, measured):
         truth = load_labelled_frame(frame).pedestrians
         assert record["pedestrians"] == np.bincount(find_range_bins(truth), minlength=5).tolist()
@@ -120,19 +120,19 @@ def test_hits_and_misses_are_the_truth_in_every_part_of_a_record(kitti, measured
             assert (np.array(tp) <= record["pedestrians"]).all()
 
 
-def test_the_stages_are_those_of_evaluate_candidates(kitti, measured):
+def test_stages_agree_with_evaluate_candidates(kitti, measured):
     report = CandidateReport()
     fill(report, open_recording(kitti), partial(measure_candidates, PAPER))
     assert report.frames == len(measured)
     for stage, score in report.scores.items():
         for key in ("tp", "fp", "fn"):
-            assert total(measured, "stages", stage, key).tolist() == getattr(score, key).tolist()
-        np.testing.assert_allclose(total(measured, "stages", stage, "error"), score.error,
+            assert add_up(measured, "stages", stage, key).tolist() == getattr(score, key).tolist()
+        np.testing.assert_allclose(add_up(measured, "stages", stage, "error"), score.error,
                                    atol=1e-4)
 
 
-def as_mounted_at(frame, height):
-    """The frame as a sensor so high would have it, metres."""
+def lower_sensor(frame, height):
+    """Return the frame as seen by a sensor at another height, metres."""
     up = np.array([0, 0, SENSOR_HEIGHT - height], np.float32)
     scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
     lower = np.eye(4)
@@ -144,8 +144,8 @@ def as_mounted_at(frame, height):
         sensor_height=height)
 
 
-def test_a_low_sensor_stands_on_the_ground_of_evaluate_candidates(kitti):
-    frames = [as_mounted_at(frame, 0.7) for frame in open_recording(kitti).frames[:2]]
+def test_low_sensor_agrees_with_evaluate_candidates(kitti):
+    frames = [lower_sensor(frame, 0.7) for frame in open_recording(kitti).frames[:2]]
     params, report = with_values(PAPER, {"ground.sensor_pose.height": 0.7}), CandidateReport()
     for frame in frames:
         report.update(score_frame(frame, params))
@@ -153,31 +153,31 @@ def test_a_low_sensor_stands_on_the_ground_of_evaluate_candidates(kitti):
     assert report.scores["stage1"].tp.sum() > 3
     for stage, score in report.scores.items():
         for key in ("tp", "fp", "fn"):
-            assert total(records, "stages", stage, key).tolist() == getattr(score, key).tolist()
+            assert add_up(records, "stages", stage, key).tolist() == getattr(score, key).tolist()
 
 
-def test_no_cpa_is_stage_2_and_near_clusters_never_have_any(measured):
+def test_zero_cpa_steps_equal_stage_2(measured):
     for record in measured:
         assert record["cpa"][0] == record["stages"]["stage2"]
         assert len(record["cpa"]) == NUMBERS.cpa_steps + 1
     for k in range(1, NUMBERS.cpa_steps + 1):
-        assert total(measured, "cpa", k, "tp")[0] == total(measured, "cpa", 0, "tp")[0]
-    without, much = (total(measured, "cpa", k, "tp") for k in (0, NUMBERS.cpa_steps))
+        assert add_up(measured, "cpa", k, "tp")[0] == add_up(measured, "cpa", 0, "tp")[0]
+    without, much = (add_up(measured, "cpa", k, "tp") for k in (0, NUMBERS.cpa_steps))
     assert much[2] > without[2]  # beyond the 30 m of the final stage
 
 
-def test_two_steps_of_cpa_are_the_final_stage_from_15_to_30_m(refined):
+def test_two_cpa_steps_equal_final_stage_at_15_to_30_m(refined):
     compared = 0
     for _, segmented, seed, found in refined:
-        sweep = of(segmented, seed, extend_cpa(2)).final.boxes
+        sweep = refine(segmented, seed, extend_cpa(2)).final.boxes
         inside = [boxes[find_range_bins(boxes) == 1] for boxes in (sweep, found.final.boxes)]
         np.testing.assert_array_equal(*inside)
         compared += len(inside[0])
     assert compared > 3
 
 
-def test_the_search_at_the_papers_setting_is_stage_1(refined, measured):
-    """In ranges without a box or a pedestrian near their limits, where clusters are cut."""
+def test_search_at_paper_setting_equals_stage_1(refined, measured):
+    """Compare ranges without boxes or pedestrians near their limits, where clusters are cut."""
     compared = 0
     for (labelled, _, _, found), record in zip(refined, measured):
         boxes, truth = found.stage1.boxes, labelled.pedestrians
@@ -197,13 +197,13 @@ def test_the_search_at_the_papers_setting_is_stage_1(refined, measured):
 
 
 @pytest.mark.parametrize("moved, hits", [(0.3, True), (0.7, False)])
-def test_hits_of_the_search_are_nearer_than_those_of_the_stages(refined, moved, hits):
+def test_search_needs_closer_hits(refined, moved, hits):
     labelled, segmented, seed, _ = refined[0]
     counts = search_clustering(segmented, seed, labelled.pedestrians + [0, 0, moved, 0, 0, 0, 0])
     assert (np.sum(counts, axis=(0, 2))[0] > 0) == hits
 
 
-def test_kept_are_those_that_both_hit():
+def test_kept_pedestrians_are_hit_twice():
     truth = np.zeros((3, 7))
     truth[:, 0], truth[:, 3:6] = [5, 20, 40], 1
     counts = count_stage(truth[[1, 2]], truth, truth[[0, 1]])
@@ -211,7 +211,7 @@ def test_kept_are_those_that_both_hit():
     assert counts["fn"] == [1, 0, 0, 0, 0] and counts["fp"] == [0] * 5
 
 
-def test_overlaps_of_boxes_that_are_known():
+def test_overlaps_of_known_boxes():
     truth = np.array([[5, 0, 0, 1, 1, 2, 0], [20, 0, 0, 1, 1, 2, np.pi / 2.0]])
     half = truth + [0, 0, 0.5, 0, 0, -1, 0]  # their upper halves
     hits, *shares, space, bev = measure_overlaps(half, truth)
@@ -230,7 +230,7 @@ def test_overlaps_of_boxes_that_are_known():
                           flags=re.M), "has 0 points"),
     (lambda label: label + "Car 0.00 0 0.00 0.00 0.00 0.00 0.00 9.00 90.00 90.00 0.00 3.00 20.00 "
      "0.00\n", "stands in a labelled Car")])
-def test_a_seed_in_empty_space_or_on_a_car_leaves_misses_and_its_reason(kitti, tmp_path, change,
+def test_bad_seed_gives_misses_and_reason(kitti, tmp_path, change,
                                                                         words):
     shutil.copytree(kitti, tmp_path / "kitti")
     label = tmp_path / "kitti/training/label_2/000002.txt"
@@ -249,25 +249,25 @@ def test_a_seed_in_empty_space_or_on_a_car_leaves_misses_and_its_reason(kitti, t
     assert row == ("000002", "4", record["no_seed"])
 
 
-def test_a_record_does_not_depend_on_what_was_measured_before(kitti, measured):
+def test_record_does_not_depend_on_earlier_frames(kitti, measured):
     frames = open_recording(kitti).frames
     for number in (3, 1):
         assert untimed(measure_frame(frames, number)) == untimed(measured[number])
 
 
-def test_the_tables_hold_what_the_records_count(measured):
+def test_tables_agree_with_records(measured):
     tables = {t.name: t for s in STM_CPA.make_sections(measured) for t in s.tables}
     for row, stage in zip(tables["table_3_6"].rows, STAGES, strict=True):
-        tp, fp, fn = (total(measured, "stages", stage, k).sum() for k in ("tp", "fp", "fn"))
+        tp, fp, fn = (add_up(measured, "stages", stage, k).sum() for k in ("tp", "fp", "fn"))
         _, recall, precision, f1, kept, error, *counts = row
         assert counts == [str(tp), str(fp), str(fn)]
         assert recall.value == pytest.approx(100 * tp / (tp + fn))
         assert precision.value == pytest.approx(100 * tp / (tp + fp))
         assert f1.value == pytest.approx(200 * tp / (2 * tp + fp + fn))
-        before = total(measured, "stages", "stage1", "tp").sum()
+        before = add_up(measured, "stages", "stage1", "tp").sum()
         assert kept.value == pytest.approx(
-            100 * total(measured, "stages", stage, "kept").sum() / before)
-        assert error.value == pytest.approx(total(measured, "stages", stage, "error").sum() / tp)
+            100 * add_up(measured, "stages", stage, "kept").sum() / before)
+        assert error.value == pytest.approx(add_up(measured, "stages", stage, "error").sum() / tp)
         assert [c.paper for c in (recall, precision, f1, kept, error)] == [*PAPER_TABLE_6[stage]]
         for cell in (recall, precision, f1):
             assert cell.low <= cell.value <= cell.high
@@ -280,7 +280,7 @@ def test_the_tables_hold_what_the_records_count(measured):
     assert len(tables["table_5"].rows) == 9 and len(tables["table_4"].rows) == 15
 
 
-def test_no_records_make_tables_without_figures():
+def test_tables_without_records_are_empty():
     for section in STM_CPA.make_sections([{"frame": "a", "skipped": "b"}]):
         for table in section.tables:
             assert all(len(row) == len(table.header) for row in table.rows)
@@ -288,7 +288,7 @@ def test_no_records_make_tables_without_figures():
                            if isinstance(cell, Cell))
 
 
-def test_the_protocol_is_table_2():
+def test_protocol_is_table_2_of_the_paper():
     assert PAPER.clustering.dbscan == DbscanParams((15, 30), (0.15, 0.30, 0.50), 10)
     assert PAPER.stm == StmParams(0.40) and PAPER.height.tolerance == 0.2
     assert (PAPER.cpa.min_range, PAPER.cpa.max_range, PAPER.cpa.steps) == (15, 30, 2)
@@ -296,7 +296,7 @@ def test_the_protocol_is_table_2():
     assert PAPER.view.enabled and PAPER.seed.source == "ground_truth"
 
 
-def test_published_figures_are_consistent():
+def test_published_values_are_consistent():
     assert sum(paper.TABLE_1.values()) == paper.PEDESTRIANS
     assert paper.TABLE_5[0] == PAPER_TABLE_6["stage2"]
     for row in paper.TABLE_9.values():
@@ -313,20 +313,20 @@ def test_published_figures_are_consistent():
 
 
 @pytest.mark.skipif(not DIGEST.is_file(), reason="the papers are not beside the checkout")
-def test_published_figures_are_those_of_the_digest():
+def test_published_values_agree_with_digest():
     text = DIGEST.read_text().partition("## B.")[0]
     cells = {line.split("|")[1].strip().partition(":")[0]: line.split("|")[2]
              for line in text.splitlines() if line.startswith("| ")}
 
     def rows(table):
-        """The numbers of each part between semicolons, without the names before colons."""
+        """Return the numbers of each part between semicolons, without names before colons."""
         return [[float(x) for x in re.findall(r"\d*\.\d+|\b\d+\b", part.rpartition(":")[2])]
                 for part in cells[table].split(";")]
 
-    def known(row):
+    def drop_none(row):
         return [value for value in row if value is not None]
 
-    assert rows("3 / 6") == [known(row) for row in PAPER_TABLE_6.values()]
+    assert rows("3 / 6") == [drop_none(row) for row in PAPER_TABLE_6.values()]
     assert rows("5") == [list(row[:3]) for row in paper.TABLE_5]
     assert rows("8") == [list(row) for row in paper.TABLE_8.values()]
     for ours, theirs in zip(paper.TABLE_9.values(), rows("9"), strict=True):
@@ -339,7 +339,7 @@ def test_published_figures_are_those_of_the_digest():
     assert f"{paper.FRAMES} frames, {paper.PEDESTRIANS} instances" in text
 
 
-def test_real_frames_have_a_record_or_a_reason(data):
+def test_real_frames_have_record_or_reason(data):
     frames = open_recording(data / "kitti_object").frames
     names = [frame.name for frame in frames]
     for number in [names.index("000134"), names.index("000000"), 1]:

@@ -74,14 +74,14 @@ def test_commands_survive_or_refuse_damaged_files():
     assert "0 failed" in done.stdout
 
 
-def test_a_node_says_that_its_curves_are_of_other_weights(nodes):
+def test_node_warns_about_curves_of_other_weights(nodes):
     fused = nodes["fused_detector"].node
     assert "other weights than" in fused.counts["doubt"] == fused.detector.warning
 
 
 @pytest.mark.no_cover
 @pytest.mark.parametrize("name", WITH_CLOUDS)
-def test_no_value_of_a_column_costs_memory_or_goes_unchecked(nodes, name):
+def test_extreme_columns_cost_no_memory(nodes, name):
     plain, node, params = cloud("columns"), nodes[name], INPUTS[name][2][0]
     turn = np.arange(len(to_array(plain))) % 7
     assert node.attempt("input/points", encode(plain), params, False).reason == ""
@@ -102,7 +102,7 @@ def test_no_value_of_a_column_costs_memory_or_goes_unchecked(nodes, name):
 @pytest.mark.parametrize("column, reading", [
     ("ground", {"clustering"}), ("in_view", set(WITH_CLOUDS)),
     ("cluster_id", {"candidate_refinement", "pointnet_detector"})])
-def test_a_column_of_several_numbers_a_point_is_refused(nodes, column, reading):
+def test_column_with_count_above_1_is_refused(nodes, column, reading):
     plain = cloud("columns")
     plain.fields = [f for f in plain.fields if f.name in ("x", "y", "z", column)]
     plain.fields[-1].offset, plain.fields[-1].datatype, plain.fields[-1].count = 12, 2, 2  # uint8
@@ -113,7 +113,7 @@ def test_a_column_of_several_numbers_a_point_is_refused(nodes, column, reading):
             assert outcome.verdict == REFUSED and "count > 1" in outcome.reason, (name, outcome)
 
 
-def test_the_same_seed_gives_the_same_cases_and_another_one_others(monkeypatch):
+def test_cases_depend_on_the_seed_only(monkeypatch):
     samples = {f"{name}/a.bin": bytes(99) for name in files.COMMANDS}
     monkeypatch.setattr(files, "samples", lambda: samples)
     for part in (messages, files, parameters):
@@ -129,7 +129,7 @@ def test_mutation_changes_a_copy(seed):
     assert mutated(CLOUD, rng)[0] != data == valid_message(CLOUD)
 
 
-def test_a_command_gives_a_result_or_one_line():
+def test_command_outcome_needs_result_or_reason():
     assert command_outcome(0, "", "").verdict == SURVIVED
     assert command_outcome(2, "", "3 frames\nError: cannot read it\n").verdict == REFUSED
     assert command_outcome(1, "left out: a frame\n", "").verdict == REFUSED

@@ -83,7 +83,7 @@ def test_impossible_sensors_are_refused(change, named):
     assert "\n" not in str(error.value)
 
 
-def test_impossible_generic_sensors_and_unknown_names_are_refused():
+def test_bad_generic_sensors_and_unknown_names_are_refused():
     for wrong in ((0, -10, 10), (16, 10, -10), (16, -95, 10)):
         with pytest.raises(InputError):
             make_generic_sensor(*wrong, 0.2, 10.0)

@@ -7,7 +7,7 @@ import pytest
 from numba import njit
 from raycast_samples import FULL, OVER_ROAD, SENSOR, crowd
 
-from experiments.realism.roughness import roughness
+from experiments.realism.roughness import compute_roughness
 from lidar_perception.simulation.raycast import cast_rays
 from lidar_perception.simulation.sensor import HDL64E, make_rays
 from lidar_perception.simulation.terrain import (
@@ -100,7 +100,7 @@ def test_grass_is_rough_and_hides_ground_behind():
     above = at[:, 2] - surface_height(meadow, at[:, 0], at[:, 1])
     assert -0.01 < above.min() and above.max() < 0.6
     wild = np.abs(at[:, 1]) > 8  # no tuft of the road's side reaches there
-    near, middle, far = roughness(at[wild], np.array([8.0, 12.0, 18.0, 30.0]))
+    near, middle, far = compute_roughness(at[wild], np.array([8.0, 12.0, 18.0, 30.0]))
     assert 0.02 < min(near, middle, far) and max(near, middle, far) < 0.1
     _, _, _, smooth = on_ground(meadow._replace(rough=0.0), sensor=HDL64E)
     assert (hits.range[met] <= smooth.range[met] + 1e-9).all()

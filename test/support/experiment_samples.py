@@ -15,7 +15,7 @@ COUNT = 12
 
 
 def count_points(frames, number):
-    """The record of a small experiment, which also looks at the frame before."""
+    """Measure a frame in a small experiment, which also reads the frame before."""
     if number == 3:
         raise InputError("three is not liked")
     before = len(frames[number - 1].load()) if number else 0
@@ -39,20 +39,20 @@ SMALL = small()
 
 
 def command(*arguments):
-    """Standard output of the command; its exceptions come out."""
+    """Run `reproduce` and return its standard output; exceptions are raised."""
     result = CliRunner().invoke(cli, ["reproduce", *map(str, arguments)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.stdout
 
 
 def untimed(folder):
-    """Records of a folder without their times, in its order."""
+    """Return the records in a folder without their times, in order."""
     head, *lines = (folder / journal.JOURNAL_NAME).read_text().splitlines()
     assert "plan" in json.loads(head)
     records = [json.loads(line) for line in lines]
     return [{k: v for k, v in record.items() if k != "ms"} for record in records]
 
 
-def lines_of(folder):
+def read_lines(folder):
     path = folder / journal.JOURNAL_NAME
     return path.read_text().splitlines() if path.exists() else []
