@@ -44,7 +44,9 @@ def main(data: Path, weights: str, min_score: float | None, kitti: Path | None) 
                  for name in MAX_DISTANCE_M}
         click.echo("  all           " + "".join(f"{_cell(name, counts)} F1 {counts.f1:4.1f}"
                                                  for name, counts in total.items()))
-    for title, change in CHANGES.items() if kitti else ():
+    if kitti is None:
+        return
+    for title, change in CHANGES.items():
         scores = evaluate_kitti(open_detector(weights or "fused", "cpu"), kitti, change)
         click.echo(f"KITTI, intensity {title}: "
                    + ", ".join(f"{name} {value:.1f}" for name, value in scores.items()))

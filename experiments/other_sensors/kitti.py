@@ -10,7 +10,7 @@ import numpy as np
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.contract import DetectionResult, Detector
-from lidar_perception.scoring.detections import detected
+from lidar_perception.scoring.detections import run_detector
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.types import PointCloud
 
@@ -38,8 +38,8 @@ def evaluate_kitti(detector: Detector, folder: Path, change: Change,
     report, recording = DetectionReport(), open_recording(folder)
     low = detector.with_min_score(MIN_SCORE)
     for frame in recording.frames[::every]:
-        report.update(detected(lambda cloud, low=low: _detect(low, cloud, change), frame,
-                               frame.truth(), frame.calibration()))
+        report.update(run_detector(lambda cloud, low=low: _detect(low, cloud, change), frame,
+                                   frame.truth(), frame.calibration()))
     ap = report.compute()["ap"]
 
     def score(name: str, row: str) -> float:
