@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
-from lidar_perception.detectors.contract import DetectionResult, Detector
+from lidar_perception.detectors.contract import Detector
 from lidar_perception.scoring.detections import run_detector
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.types import PointCloud
 
 MIN_SCORE = 0.05  # of the boxes that average precision is computed from
 
@@ -38,8 +38,12 @@ def evaluate_kitti(detector: Detector, folder: Path, change: Change,
     report, recording = DetectionReport(), open_recording(folder)
     low = detector.with_min_score(MIN_SCORE)
     for frame in recording.frames[::every]:
-        report.update(run_detector(lambda cloud, low=low: _detect(low, cloud, change), frame,
-                                   frame.truth(), frame.calibration()))
+        cloud = frame.load()
+        assert cloud.intensity is not None  # KITTI has it
+        truth, calibration = frame.truth(), frame.calibration()
+        changed = Frame.of(frame.name, replace(cloud, intensity=change(cloud.intensity)), truth,
+                           calibration)
+        report.update(run_detector(low, changed, truth, calibration))
     ap = report.compute()["ap"]
 
     def score(name: str, row: str) -> float:
@@ -51,8 +55,3 @@ def evaluate_kitti(detector: Detector, folder: Path, change: Change,
              "Cyclist BEV .25": score("Cyclist", "bev_relaxed")}
     relaxed = [score(name, "bev_relaxed") for name in ("Car", "Pedestrian", "Cyclist")]
     return {**found, "mean BEV .5/.25/.25": float(np.mean(relaxed))}
-
-
-def _detect(detector: Detector, cloud: PointCloud, change: Change) -> DetectionResult:
-    assert cloud.intensity is not None  # KITTI has it
-    return detector(replace(cloud, intensity=change(cloud.intensity)))
