@@ -78,9 +78,9 @@ def test_a_node_reads_dark_clouds_in_the_scale_of_its_stream():
         return make_cloud_message(np.column_stack([np.ones((len(values), 3)), values]), stamp)
 
     params = SimpleNamespace(input=InputParams(), crop=CropParams(), ground=GroundParams())
-    placing = SimpleNamespace(level_frame=lambda frame: frame)
-    transforms = SimpleNamespace(placing=lambda header: placing,
-                                 with_mounting=lambda params, placing: params)
+    placement = SimpleNamespace(level_frame=lambda frame: frame)
+    transforms = SimpleNamespace(find_placement=lambda header: placement,
+                                 with_mounting=lambda params, placement: params)
     node = SimpleNamespace(params=params, transforms=transforms, counts={})
     check, other = SensorCheck(node), SensorCheck(node)
     bright, dark = WHOLE[255], np.float32([0, 1, 1])

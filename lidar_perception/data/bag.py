@@ -91,7 +91,7 @@ class BagWriter:
             refuse_other_files(self.path, ("metadata.yaml", "*.mcap*", "*.db3*"))
 
     def __enter__(self) -> BagWriter:
-        with ExitStack() as stack, self._named():
+        with ExitStack() as stack, self._name_write_error():
             stack.enter_context(lock_folder(self.partial))
             self._check_target()  # another process may just have written it
             for old in self.partial.iterdir():
@@ -104,7 +104,7 @@ class BagWriter:
         return self
 
     @contextmanager
-    def _named(self) -> Iterator[None]:
+    def _name_write_error(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -128,13 +128,13 @@ class BagWriter:
         """Append a message: an object of bag_message, or CDR bytes."""
         channel = self.channels[topic]
         raw = message if isinstance(message, bytes) else encode(message)
-        with self._named():
+        with self._name_write_error():
             self.mcap.add_message(channel, stamp_ns, raw, stamp_ns)
         self.topics[list(self.channels).index(topic)]["message_count"] += 1
         self.times.append(stamp_ns)
 
     def __exit__(self, kind, error, trace) -> None:
-        with self.open, self._named():
+        with self.open, self._name_write_error():
             try:
                 self._finish()
             except OSError:
@@ -282,7 +282,7 @@ class Bag:
             raise InputError(f"{self.path} has no topic {topic}; it has {self.content}")
 
     def raw_messages(self, topics: Iterable[str] | None = None, start_ns: int | None = None,
-            stop_ns: int | None = None) -> Iterator[tuple[str, int, bytes]]:
+                     stop_ns: int | None = None) -> Iterator[tuple[str, int, bytes]]:
         """Yield (topic, time in ns, CDR bytes) in order of time.
 
         Args:
@@ -296,11 +296,11 @@ class Bag:
         wanted = self.topics.keys() & (self.topics if topics is None else {*topics})
         start, stop = START if start_ns is None else start_ns, END if stop_ns is None else stop_ns
         return merge_streams(
-            (file.times[0], partial(self._of_file, path, file, wanted, start, stop))
+            (file.times[0], partial(self._read_file, path, file, wanted, start, stop))
             for path, file in self.files
             if file.times and file.times[0] < stop and start <= file.times[1])
 
-    def _of_file(self, path: Path, file: StorageFile, wanted: set[str], start: int, stop: int
+    def _read_file(self, path: Path, file: StorageFile, wanted: set[str], start: int, stop: int
                  ) -> Iterator[tuple[str, int, bytes]]:
         names = {topic.id: topic.name for topic in file.topics if topic.name in wanted
                  and topic.encoding == "cdr" and topic.type == self.topics[topic.name]}

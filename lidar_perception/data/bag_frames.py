@@ -135,7 +135,7 @@ class BagFrames(Sequence):
             for i, (_, time, data) in enumerate(bag.raw_messages({self.points})):
                 stamp = self._stamp(data, time)
                 names[stamp] += 1
-                yield self._frame(i, time, stamp, names[stamp], partial(bytes, data))
+                yield self._make_frame(i, time, stamp, names[stamp], partial(bytes, data))
 
     def stamps(self) -> np.ndarray:
         """Return the stamps (count,) int64 ns of all clouds. Reads the whole bag once."""
@@ -154,9 +154,9 @@ class BagFrames(Sequence):
         i %= self.clouds
         if i == 0 and self.first is not None:
             time, data = self.first
-            return self._frame(0, time, self._stamp(data, time), 1, lambda: data)
+            return self._make_frame(0, time, self._stamp(data, time), 1, lambda: data)
         time, before, stamp, occurrence = self._index[i]
-        return self._frame(i, time, stamp, occurrence, partial(self._read, time, before))
+        return self._make_frame(i, time, stamp, occurrence, partial(self._read, time, before))
 
     @cached_property
     def _index(self) -> list[tuple[int, int, int, int]]:
@@ -245,12 +245,12 @@ class BagFrames(Sequence):
         """Poses of the frame_id of the first cloud."""
         return BagPoses(self.handle, _read_frame_id(self.first[1]) if self.first else "")
 
-    def _frame(self, i: int, time: int, stamp: int, occurrence: int,
-               data: Callable[[], bytes]) -> Frame:
+    def _make_frame(self, i: int, time: int, stamp: int, occurrence: int,
+                    data: Callable[[], bytes]) -> Frame:
         name = str(stamp) if occurrence == 1 else f"{stamp}-{occurrence}"  # stamps may repeat
-        return Frame(name, stamp, partial(self._load, time, data), partial(self._truth, stamp),
-                     point_truth=partial(self._point_truth, time, data),
-                     calibration=partial(self._calibration, time),
+        return Frame(name, stamp, partial(self._load, time, data), partial(self._read_truth, stamp),
+                     point_truth=partial(self._read_point_truth, time, data),
+                     calibration=partial(self._read_calibration, time),
                      pose=lambda: self.poses(stamp), index=i, sensor_height=self.sensor_height,
                      files=self.files, native=lambda: decode_cloud(data(), self.kind),
                      intensity_max=lambda: self.full_scale)
@@ -275,7 +275,7 @@ class BagFrames(Sequence):
                 return msg
         return None
 
-    def _point_truth(self, time: int, data: Callable[[], bytes]) -> PointTruth | None:
+    def _read_point_truth(self, time: int, data: Callable[[], bytes]) -> PointTruth | None:
         if (msg := self.decode_labelled(data())) is None:
             return None
         with self._error_context(time):
@@ -284,10 +284,10 @@ class BagFrames(Sequence):
         assert classes is not None and instances is not None  # see decode_labelled
         return PointTruth(classes.astype(np.uint16), instances.astype(np.uint16))
 
-    def _truth(self, stamp: int) -> GroundTruth | None:
+    def _read_truth(self, stamp: int) -> GroundTruth | None:
         return self._annotations[0].get(stamp)
 
-    def _calibration(self, time: int) -> Calibration | None:
+    def _read_calibration(self, time: int) -> Calibration | None:
         _, infos, transforms = self._annotations
         info, transform = _find_latest(infos, time), _find_latest(transforms, time)
         return read_calibration(info, transform) if info and transform else None

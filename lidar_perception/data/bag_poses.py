@@ -75,7 +75,7 @@ class BagPoses:
         if self.odometry:
             if self.frame_id == self._first.header.frame_id.lstrip("/"):  # clouds in a fixed frame
                 return np.tile(np.eye(4), (len(times), 1, 1))
-            return self._carrier_poses(times) @ self._sensor_in_carrier(times)
+            return self._odometry_poses(times) @ self._sensor_in_odometry_child(times)
         if not self.fixed:
             raise MissingTransform(f"{self.path} has neither odometry nor a TF in which "
                                    f"'{self.frame_id}' moves; record one of them")
@@ -90,10 +90,11 @@ class BagPoses:
     def needs_no_tf(self) -> bool:
         """True if nodes need no TF: without poses, or if /odom is the odometry of the sensor
         itself."""
-        return not self.available or (self.odometry == ODOMETRY and self.carrier == self.frame_id)
+        return not self.available or (self.odometry == ODOMETRY
+                                      and self.odometry_child == self.frame_id)
 
     @cached_property
-    def carrier(self) -> str:
+    def odometry_child(self) -> str:
         """Child frame of the odometry; "" without odometry."""
         return self._first.child_frame_id.lstrip("/") if self.odometry else ""
 
@@ -114,7 +115,7 @@ class BagPoses:
 
         None if TF does not connect the two, or if the sensor moves in that frame.
         """
-        base_chain = self._chain(base)
+        base_chain = self._list_parents(base)
         common = next((frame for frame in self._above if frame in base_chain), None)
         if common is None or not all(map(self._first_transforms.is_fixed, (
                 *self._above[:self._above.index(common)], *base_chain[:base_chain.index(common)]))):
@@ -125,8 +126,8 @@ class BagPoses:
     def base(self) -> str:
         """Frame of the robot: the child frame of the odometry, else the highest frame above the
         sensor in which it is fixed; "" if TF has none."""
-        if self.carrier and self.carrier != self.frame_id:
-            return self.carrier
+        if self.odometry_child and self.odometry_child != self.frame_id:
+            return self.odometry_child
         # Stop at the first moving link: above it, odom may be fixed in a map.
         fixed = len([*takewhile(self._first_transforms.is_fixed, self._above[:-1])])
         return self._above[fixed] if fixed else ""
@@ -160,24 +161,24 @@ class BagPoses:
                              "too") from None
         return replace(objects, boxes=transform_boxes(objects.boxes, pose))
 
-    def carrier_pose(self, stamp_ns: int) -> np.ndarray:
+    def odometry_pose(self, stamp_ns: int) -> np.ndarray:
         """Return the pose (4, 4) of the odometry; raise MissingTransform if it is unknown."""
-        return self._carrier_poses(np.array([stamp_ns]))[0]
+        return self._odometry_poses(np.array([stamp_ns]))[0]
 
-    def _carrier_poses(self, times: np.ndarray) -> np.ndarray:
+    def _odometry_poses(self, times: np.ndarray) -> np.ndarray:
         return self._odometry.lookup_many(FIXED, MOVING, times, MAX_GAP_S)
 
-    def _sensor_in_carrier(self, times: np.ndarray) -> np.ndarray:
+    def _sensor_in_odometry_child(self, times: np.ndarray) -> np.ndarray:
         """Return the pose of the sensor in the child frame of the odometry.
 
         (4, 4) if it is fixed, else (M, 4, 4) at times (M,) ns; identity if TF does not connect
         them.
         """
-        if not {*self._above} & {*self._chain(self.carrier)}:
+        if not {*self._above} & {*self._list_parents(self.odometry_child)}:
             return np.eye(4)
-        if (pose := self.find_mount(self.carrier)) is not None:
+        if (pose := self.find_mount(self.odometry_child)) is not None:
             return pose
-        return self._tree.lookup_many(self.carrier, self.frame_id, times, MAX_GAP_S)
+        return self._tree.lookup_many(self.odometry_child, self.frame_id, times, MAX_GAP_S)
 
     @cached_property
     def _odometry(self) -> TransformTree:
@@ -205,15 +206,16 @@ class BagPoses:
 
     @cached_property
     def _above(self) -> list[str]:
-        return self._chain(self.frame_id)
+        return self._list_parents(self.frame_id)
 
-    def _chain(self, frame: str) -> list[str]:
+    def _list_parents(self, frame: str) -> list[str]:
         return _find_chain(self._first_transforms, frame)
 
     @cached_property
     def _tree(self) -> TransformTree:
         """All transforms above the sensor and above the child frame of the odometry."""
-        tree, above = TransformTree(keeps_all=True), {*self._above, *self._chain(self.carrier)}
+        tree = TransformTree(keeps_all=True)
+        above = {*self._above, *self._list_parents(self.odometry_child)}
         for topic, _, msg in self.handle.bag().messages(self.transforms):
             msg.transforms[:] = [transform for transform in msg.transforms
                                  if transform.child_frame_id.lstrip("/") in above]

@@ -25,7 +25,7 @@ NANOSECOND_DIGITS = 9
 def list_cloud_files(path: Path) -> list[Path]:
     """Return the point cloud files at a path: the file itself, or those in a folder.
 
-    They are in order of the times in their names, else of the numbers in their names (2 before 10).
+    They are sorted by the times in their names, else by the numbers in their names (2 before 10).
     """
     files = [file for file in ([path] if path.is_file() else path.glob("*")) if is_cloud(file)]
     if stamps := _parse_stamps(files):
@@ -35,7 +35,7 @@ def list_cloud_files(path: Path) -> list[Path]:
 
 
 def is_layout(path: Path) -> bool:
-    """Return True for a point cloud file, or a folder with some."""
+    """Return True for a point cloud file, or a folder that contains any."""
     return bool(list_cloud_files(path))
 
 

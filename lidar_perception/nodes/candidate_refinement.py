@@ -39,7 +39,7 @@ class CandidateRefinement(ManagedNode):
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, indices = to_point_cloud(msg)
-            frame = self.transforms.placing(msg.header).level_frame(frame)
+            frame = self.transforms.find_placement(msg.header).level_frame(frame)
             ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
             if clusters is None:
                 raise InputError("the cloud has no column 'cluster_id'; remap ~/input/points to "

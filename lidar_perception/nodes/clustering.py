@@ -39,7 +39,7 @@ class Clustering(ManagedNode):
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, indices = to_point_cloud(msg)
-            frame = self.transforms.placing(msg.header).level_frame(frame)
+            frame = self.transforms.find_placement(msg.header).level_frame(frame)
             column = read_column(msg, "ground", indices)
             ground = np.zeros(len(frame), bool) if column is None else column > 0
             ids = cluster_obstacles(frame.xyz, ground, self.params.clustering)

@@ -32,12 +32,12 @@ class EgoInput:
 
     Args:
         node: node with transforms.
-        params: returns the present parameters of the group ego.
+        params: returns the current parameters of the group ego.
         clouds: the node itself subscribes to clouds, which wait for their poses, and passes them to
             find_pose(). Otherwise KISS-ICP subscribes to ~/input/points.
 
     Attributes:
-        source: present source of the poses, see choose_source.
+        source: current source of the poses, see choose_source.
         is_mounting_known: the pose of the sensor in the child frame of the odometry is available.
     """
 
@@ -71,7 +71,7 @@ class EgoInput:
         """
         frame_id, stamp = header.frame_id, to_ns(header.stamp)
         if (self.icp is not None and self.clouds and xyz is not None and len(xyz)
-                and self._uses_scans()):
+            and self._uses_scans()):
             self._register(header, xyz)
         pose, self.pose_problem = None, ""
         try:
@@ -105,7 +105,7 @@ class EgoInput:
 
     def find_problem(self, frame_id: str, stamp: int) -> str | None:
         """Return what is wrong with the poses of the last frame, with the remedy, or None."""
-        wanted, carrier = self.params().source, self.transforms.carrier
+        wanted, odometry_child = self.params().source, self.transforms.odometry_child
         last = self.transforms.odometry_ns
         if self.source == "odometry" and last is not None:
             topic = self.node.resolve_topic_name("~/input/odometry")
@@ -126,9 +126,9 @@ class EgoInput:
             return (f"no pose from {self.node.resolve_topic_name(f'~/input/{topic}')} yet: "
                     "tracks are relative to the sensor")
         if not self.is_mounting_known and frame_id:
-            return (f"the odometry is of '{carrier}', the detections are in '{frame_id}', and TF "
-                    "does not connect them: they are assumed to coincide"
-                    + ("; its child_frame_id is empty" if not carrier else ""))
+            return (f"the odometry is of '{odometry_child}', the detections are in '{frame_id}', "
+                    "and TF does not connect them: they are assumed to coincide"
+                    + ("; its child_frame_id is empty" if not odometry_child else ""))
         if self.source == "kiss_icp" and self.is_disconnected:
             return (f"KISS-ICP moves with '{self.scan_frame}', the detections are in '{frame_id}', "
                     "and TF does not connect them: tracks are relative to the sensor")
@@ -144,11 +144,11 @@ class EgoInput:
         if self.scan_ns:
             available.add("kiss_icp")
         if choose_source(wanted, {"tf", *available}) == "tf" != self.source and (
-                self._connected(frame_id, stamp)):
+                self._is_connected(frame_id, stamp)):
             available.add("tf")
         self.source, self.is_mounting_known = choose_source(wanted, available), True
         if self.source == "odometry":
-            self.is_mounting_known = self.transforms.knows_motion_of(frame_id)
+            self.is_mounting_known = self.transforms.is_connected_to_odometry(frame_id)
             if not self.is_mounting_known:
                 self.transforms.subscribe_to_tf()
         if not self._uses_scans():
@@ -156,7 +156,7 @@ class EgoInput:
             self.node.counts.pop(ICP_MS, None)
         return self.source
 
-    def _connected(self, frame_id: str, stamp: int) -> bool:
+    def _is_connected(self, frame_id: str, stamp: int) -> bool:
         try:
             self._look_up("tf", frame_id, stamp, self.params().max_gap)
         except MissingTransform as error:
@@ -168,7 +168,7 @@ class EgoInput:
         return self.source in (NO_SOURCE, "kiss_icp")
 
     def _look_up(self, source: str, frame_id: str, stamp: int,
-            max_gap: float | None) -> np.ndarray | None:
+                 max_gap: float | None) -> np.ndarray | None:
         at = np.array([stamp])
         if source == "kiss_icp":
             scan = self.scans.lookup(START, SCAN, stamp, max_gap)

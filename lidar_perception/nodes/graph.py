@@ -73,7 +73,7 @@ NETWORKS = tuple(name for name, nodes in SINGLE_PROCESS_NODES.items()
 
 
 def build_graph(detectors: Sequence[str], single: bool = False,
-             tracking: bool = False) -> dict[str, Mapping[str, str]]:
+                tracking: bool = False) -> dict[str, Mapping[str, str]]:
     """Return the nodes of one or several detectors, each node once.
 
     Args:
@@ -98,7 +98,7 @@ def build_graph(detectors: Sequence[str], single: bool = False,
 
 
 def find_trackers(detectors: Sequence[str]) -> dict[str, str]:
-    """Return {name of a tracker: its detector}."""
+    """Return the detector of each tracker, by the name of the tracker."""
     return {f"{name}_{TRACKER}" if len(detectors) > 1 else TRACKER: name for name in detectors}
 
 
@@ -140,7 +140,7 @@ def prefers_one_process() -> bool:
 
 
 def list_result_topics(single: bool = False, detector: str = "candidates") -> dict[str, str]:
-    """Return {stage: topic of its detections} without a namespace; networks have one stage."""
+    """Return the topic of detections by stage, without a namespace; networks have one stage."""
     node = find_result_node(detector, single)
     before = ("stage1", "stage2") if detector == "candidates" else ()
     return {**{stage: f"/{node}/debug/{stage}" for stage in before},
@@ -173,7 +173,7 @@ def configure_evaluator(file: Path | str, single: bool = False
 
 
 def find_connected_outputs(graph: Graph) -> dict[str, set[str]]:
-    """Return {node: those of its topics that another node of the graph subscribes to}, without a
+    """Return the topics of each node that another node of the graph subscribes to, without a
     namespace."""
     subscribed = {f"/{relative_name(topic)}"
                   for remap in graph.values() for topic in remap.values()}
@@ -181,7 +181,7 @@ def find_connected_outputs(graph: Graph) -> dict[str, set[str]]:
 
 
 def list_awaited_topics(single: bool = False, points: int = 1, truth: int = 2,
-             detector: str = "candidates") -> list[str]:
+                        detector: str = "candidates") -> list[str]:
     """Return the parameter wait_for of bag_player for a graph.
 
     It waits for subscribers of the clouds and of the labels (the seed input and an evaluator), and

@@ -22,7 +22,7 @@ from msg_utils.stamps import to_ns
 
 
 class GroundSegmentation(ManagedNode):
-    """Plane fit, Patchwork++ or cloth simulation.
+    """Ground segmentation by plane fit, Patchwork++ or cloth simulation.
 
     ~/output/ground, nonground and obstacles are computed only while there are subscribers.
     """

@@ -72,7 +72,7 @@ class CameraInput:
             f"CameraInfo's '{self.info.header.frame_id}'")
 
     def get(self, header: Any, params: ViewParams) -> Camera | None:
-        """Return the camera for the levelled points of a cloud, or None.
+        """Return the camera for the points of a cloud in the level frame, or None.
 
         None while view is disabled, and until the pose of the camera is available.
         """
@@ -80,7 +80,7 @@ class CameraInput:
             return None
         lidar, camera = header.frame_id, self.info.header.frame_id
         transform = self.transforms.get((lidar, camera)) or self.transforms.get((camera, lidar))
-        level = self.node.transforms.placing(header).level
+        level = self.node.transforms.find_placement(header).level
         if transform is not None:
             result = read_camera(self.info, transform)
         else:
@@ -213,7 +213,7 @@ class SeedInput:
                                                "it published, with the same header.stamp?"))
         else:
             people = truth.of_class(PEDESTRIAN)
-            level = self.node.transforms.placing(cloud.header).level
+            level = self.node.transforms.find_placement(cloud.header).level
             self.deliver(cloud, make_truth_source(people if level is None
                                                   else transform_boxes(people, level)))
 

@@ -187,9 +187,9 @@ def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
     """Return the launch nodes, one for each process, for the values of the arguments."""
     graph, detectors, single = _graph(value), _detectors(value), value["single"] == "true"
     prefix, users = value["name_prefix"], list_parameter_files(value["config"])
-    files = {node: [_own_file(name, config_folder), *users] for name in detectors
+    files = {node: [_locate_own_file(name, config_folder), *users] for name in detectors
              for node in (SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[name]}
-    files |= {node: _expert_files(value, config_folder) for node in EXPERTS}
+    files |= {node: _list_expert_files(value, config_folder) for node in EXPERTS}
     files |= {node: [str(config_folder / f"{TRACKER}.param.yaml"), *users]
               for node in find_trackers(detectors)}
     topics = {relative_name(POINTS): value["points"], relative_name(ODOMETRY): value["odometry"]}
@@ -255,7 +255,7 @@ def describe_conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
     if given not in ("", *CONFIGS):
         return []
     chosen, users = given or detectors[0], list_parameter_files(value["config"])
-    numbers = {name: _expert_numbers([_own_file(name, config_folder), *users])
+    numbers = {name: _read_expert_parameters([_locate_own_file(name, config_folder), *users])
                for name in (chosen, *detectors)}
     lines = []
     for name in detectors:
@@ -267,18 +267,18 @@ def describe_conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
     return lines
 
 
-def _own_file(detector: str, config_folder: Path) -> str:
+def _locate_own_file(detector: str, config_folder: Path) -> str:
     return str(config_folder / f"{CONFIGS[detector]}.param.yaml")
 
 
-def _expert_files(value: dict[str, str], config_folder: Path) -> list[str]:
+def _list_expert_files(value: dict[str, str], config_folder: Path) -> list[str]:
     """Return the parameter files of ground and clusters."""
     chosen = value["experts"] if value["experts"] in CONFIGS else _detectors(value)[0]
     users = list_parameter_files(value["config"], value["experts"])
-    return [_own_file(chosen, config_folder), *users]
+    return [_locate_own_file(chosen, config_folder), *users]
 
 
-def _expert_numbers(files: list[str]) -> dict[str, Any]:
+def _read_expert_parameters(files: list[str]) -> dict[str, Any]:
     """Return the parameters of ground and clusters with these files."""
     known = {key: list(v) if isinstance(v, tuple) else v
              for group in (GroundNodeParams(), ClusteringNodeParams())
@@ -363,7 +363,7 @@ def _degrees(text: str) -> float:
 
 
 def _weights(text: str, networks: list[str]) -> dict[str, str]:
-    """Return {network: file}, parsed from FILE or NAME=FILE,NAME=FILE."""
+    """Parse FILE or NAME=FILE,NAME=FILE to the file of each network."""
     if not text:
         return {}
     if len(networks) == 1 and not text.startswith(f"{networks[0]}="):

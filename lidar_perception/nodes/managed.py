@@ -113,7 +113,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
                       "activate")
 
     def _change(self, change: Callable, request: Any, response: Any) -> Any:
-        """Refuse a transition that the present state does not allow; rclpy would end the node."""
+        """Refuse a transition that the current state does not allow; rclpy would end the node."""
         transition = request.transition.label or request.transition.id
         if transition in allowed_transitions(self):
             self._retry_at = None

@@ -16,7 +16,7 @@ MAX_NAMES = 200        # that are checked
 
 
 def find_node_parameters(name: str) -> dict[str, Any]:
-    """Return {parameter of a node: its dataclass field, with the default of the node}."""
+    """Return the dataclass field of each parameter of a node, with the default of the node."""
     fields: dict[str, Any] = {}
     for path in NODES[name][1:]:
         module, _, params = path.rpartition(".")

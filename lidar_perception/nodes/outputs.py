@@ -35,10 +35,10 @@ def to_output_frame(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[An
     Returns:
         Header in the output frame, and boxes; float64, as a map may be far from its origin.
     """
-    placing = node.transforms.placing(header)
-    if placing.frame_id != header.frame_id:
-        header = make_header(to_ns(header.stamp), placing.frame_id, bag_message)
-    return header, boxes if placing.out is None else transform_boxes(boxes, placing.out)
+    placement = node.transforms.find_placement(header)
+    if placement.frame_id != header.frame_id:
+        header = make_header(to_ns(header.stamp), placement.frame_id, bag_message)
+    return header, boxes if placement.out is None else transform_boxes(boxes, placement.out)
 
 
 class ClusterBoxes:
@@ -80,18 +80,18 @@ class Obstacles:
 
         Args:
             msg: the cloud.
-            xyz: (M, 3) levelled points.
+            xyz: (M, 3) points in the level frame.
             ground: (M,) bool.
             indices: (M,) indices of the points in the cloud.
         """
         if self.publisher.get_subscription_count():
-            placing = self.node.transforms.placing(msg.header)
-            params = self.node.transforms.with_mounting(self.node.params, placing)
+            placement = self.node.transforms.find_placement(msg.header)
+            params = self.node.transforms.with_mounting(self.node.params, placement)
             chosen = find_obstacles(xyz, ground, self.node.node_params.obstacles,
                                     params.ground.sensor_pose)
             self.publisher.publish(make_xyz_cloud(
-                msg, placing.to_cloud_frame(xyz.compress(chosen, axis=0)), indices.compress(chosen),
-                bag_message))
+                msg, placement.to_cloud_frame(xyz.compress(chosen, axis=0)),
+                indices.compress(chosen), bag_message))
 
 
 class DetectionMarkers:
@@ -128,13 +128,13 @@ class DetectionOutputs:
     def publish(self, header: Any, detections: Detections, ms: Mapping[str, float],
                 xyz: np.ndarray, *, weak: Detections | None = None,
                 clusters: np.ndarray | None = None) -> str | None:
-        """Publish the detections of a levelled cloud, and their tracks in the frame of the cloud.
+        """Publish detections in the level frame, and their tracks in the frame of the cloud.
 
         Args:
             header: header of the cloud.
             detections: detections above the thresholds.
             ms: {step: its time in ms}.
-            xyz: (N, 3) levelled points, for the tracker.
+            xyz: (N, 3) points in the level frame, for the tracker.
             weak: all detections for the tracker, also those below the thresholds.
             clusters: (K,) cluster_id of each detection.
 
@@ -153,11 +153,11 @@ class DetectionOutputs:
                 publisher.publish(Float64(data=ms[step]))
         if self.tracks is None:
             return None
-        placing = self.node.transforms.placing(cloud_header)
-        if placing.level is not None:
+        placement = self.node.transforms.find_placement(cloud_header)
+        if placement.level is not None:
             tracked = replace(
-                tracked, boxes=transform_boxes(tracked.boxes, invert_pose(placing.level)))
-        return self.tracks.publish(cloud_header, tracked, placing.to_cloud_frame(xyz))
+                tracked, boxes=transform_boxes(tracked.boxes, invert_pose(placement.level)))
+        return self.tracks.publish(cloud_header, tracked, placement.to_cloud_frame(xyz))
 
 
 class CandidateOutputs:
@@ -175,7 +175,7 @@ class CandidateOutputs:
 
         Args:
             header: header of the cloud.
-            xyz: (N, 3) levelled points.
+            xyz: (N, 3) points in the level frame.
             find: returns the candidates; after an InputError none are published.
             problem: a known problem of the frame, for the diagnostics.
         """
@@ -189,7 +189,7 @@ class CandidateOutputs:
                 output_header, boxes = to_output_frame(self.node, header, detections.boxes)
                 markers.publish(output_header, replace(detections, boxes=boxes))
         tracking_problem = self.final.publish(header, candidates.final, candidates.ms, xyz,
-                                       clusters=candidates.clusters)
+                                              clusters=candidates.clusters)
         self._diagnose(candidates, problem or tracking_problem)
 
     def _diagnose(self, candidates: Candidates, problem: str | None) -> None:

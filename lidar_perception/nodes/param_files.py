@@ -38,14 +38,15 @@ def read_sections(path: str | Path) -> dict[str, dict[str, Any]]:
         raise InputError(f"{path} is not a parameter file; see config/ for the form")
     visited = count()
     sections: dict[str, dict[str, Any]] = {}
-    for node, group in _leaves(path, content, visited, "/", stop="ros__parameters"):
+    for node, group in _iterate_leaves(path, content, visited, "/", stop="ros__parameters"):
         values = group if isinstance(group, dict) else {}
-        sections[node] = {**sections.get(node, {}), **dict(_leaves(path, values, visited, "."))}
+        leaves = dict(_iterate_leaves(path, values, visited, "."))
+        sections[node] = {**sections.get(node, {}), **leaves}
     return sections
 
 
-def _leaves(path: str | Path, group: dict, visited: Iterator[int], separator: str,
-            prefix: str = "", stop: str | None = None) -> Iterator[tuple[str, Any]]:
+def _iterate_leaves(path: str | Path, group: dict, visited: Iterator[int], separator: str,
+                    prefix: str = "", stop: str | None = None) -> Iterator[tuple[str, Any]]:
     """Yield the joined name and the value of each leaf, or of each key `stop`."""
     for key, value in group.items():
         if next(visited) >= MAX_KEYS:
@@ -53,7 +54,8 @@ def _leaves(path: str | Path, group: dict, visited: Iterator[int], separator: st
         if key == stop:
             yield prefix.removesuffix(separator), value
         elif isinstance(value, dict):
-            yield from _leaves(path, value, visited, separator, f"{prefix}{key}{separator}", stop)
+            yield from _iterate_leaves(path, value, visited, separator,
+                                       f"{prefix}{key}{separator}", stop)
         elif stop is None:
             yield f"{prefix}{key}", value
 

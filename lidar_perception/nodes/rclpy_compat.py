@@ -66,7 +66,7 @@ def state_label(node: Any) -> str:
 
 
 def allowed_transitions(node: Any) -> set[int | str]:
-    """Return the ids and labels of the transitions that the present state allows."""
+    """Return the ids and labels of the transitions that the current state allows."""
     return {key for number, label, *_ in node._state_machine.available_transitions
             for key in (number, label)}
 

@@ -60,7 +60,7 @@ class Reception:
             link, and with whether the cloud may wait. Returns what the cloud still needs, or None.
             A cloud that may wait (up to input.max_wait seconds) and needs something is delivered
             again at retry().
-        params: returns the present parameters of the group input.
+        params: returns the current parameters of the group input.
         what: name of one message in diagnostics.
     """
 
@@ -135,7 +135,7 @@ class Reception:
         """Subscribe with a queue in the middleware for clouds that arrive during work."""
         kinds = [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH]
         events = SubscriptionEventCallbacks(matched=lambda _: self.adapt_trigger.trigger(),
-                                          incompatible_qos=lambda _: self.adapt_trigger.trigger())
+                                            incompatible_qos=lambda _: self.adapt_trigger.trigger())
         on_message: Any = self._on_message  # the annotation of rclpy lacks the message info
         profile = QoSProfile(depth=max(DEPTH, self.params().queue), reliability=self.reliability)
         self.subscription = self.node.create_subscription(
@@ -273,16 +273,16 @@ class Reception:
         if self.waiting and self.needs is not None:
             return [*problems, ("waiting", WARN, f"the {self.what} on {self.topic} waits for "
                                 f"{self.needs}")]
-        if silence := self._silence():
+        if silence := self._find_silence():
             return [*problems, silence]
         expected, rate = self.expected_rate(), self.arrivals.measure_rate()
         if expected and rate and rate < params.min_rate * expected:
             problems.append(("rate", WARN, f"{rate:.1f} Hz on {self.topic} where {expected:.1f} Hz "
-                             f"are expected (input.rate): {self._questions()[1]}"))
+                             f"are expected (input.rate): {self._list_questions()[1]}"))
         sent, lost, dropped = self.arrivals.count_recent()
         total = max(sent, WINDOW)  # so that one lost cloud of the first two is not a half
         if lost > params.max_lost * total:
-            remedy = self._remedy(publishers or self.last_publishers)
+            remedy = self._suggest_remedy(publishers or self.last_publishers)
             problems.append(("lost", WARN, f"{lost} of the last {sent} {self.what}s on "
                              f"{self.topic} were lost on the way; {remedy}"))
         if dropped > params.max_dropped * total:
@@ -291,7 +291,7 @@ class Reception:
                              "than their period on this machine, or they wait for poses"))
         return problems
 
-    def _silence(self) -> Problem | None:
+    def _find_silence(self) -> Problem | None:
         """Return a problem if clouds have stopped; a slow sensor is not silent between clouds."""
         params, expected = self.params(), self.expected_rate()
         period = 1 / expected if expected else 0.0
@@ -302,10 +302,10 @@ class Reception:
             return None
         kind, level, limit = ("stale", STALE, stale) if silent > stale else ("silent", ERROR, error)
         return (kind, level, f"no {self.what} on {self.topic} for more than {round(limit, 1):g} s: "
-                f"{self._questions()[0]}")
+                f"{self._list_questions()[0]}")
 
-    def _questions(self) -> list[str]:
-        """Return the questions of QUESTIONS for the present publishers."""
+    def _list_questions(self) -> list[str]:
+        """Return the questions of QUESTIONS for the current publishers."""
         names = sorted({_name(p) for p in self.last_publishers})
         if names and all(name.endswith("_player") for name in names):
             kind = "player"  # bag_player, rosbag2_player
@@ -329,7 +329,7 @@ class Reception:
                 f"but the subscription is reliable, so no messages arrive: {remedy}, or let it "
                 "publish reliable")
 
-    def _remedy(self, publishers: list[Any]) -> str:
+    def _suggest_remedy(self, publishers: list[Any]) -> str:
         offered = {p.qos_profile.reliability for p in publishers}
         if BEST_EFFORT in offered:
             sysctl = (f", or set net.core.rmem_max to {4 * SOCKET_BUFFER} (sysctl) and start this "

@@ -118,15 +118,15 @@ class LidarNode(Node):
         if unknown := [c.name for c in changes if not self.has_parameter(c.name)]:
             guess = closest_name(unknown[0], parameter_names(self))
             raise UnknownParameterError(f"{self.get_fully_qualified_name()} has no parameter "
-                                   f"{unknown[0][:80]!r}" + (f"; did you mean {guess!r}?"
-                                                             if guess else ""))
+                                        f"{unknown[0][:80]!r}" + (f"; did you mean {guess!r}?"
+                                                                  if guess else ""))
         return [convert_to_declared_type(c, self.get_parameter(c.name).type_) for c in changes]
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
         try:
             params, node_params = (group and with_values(
                 group, {c.name: c.value for c in changes if c.name in flatten(group)})
-                for group in (self.params, self.node_params))
+                                   for group in (self.params, self.node_params))
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
         self.params, self.node_params = params, node_params
@@ -219,7 +219,7 @@ class LidarNode(Node):
         A message that differs from the last one in more than its numbers is logged and published at
         once. Expected states, such as waiting for input after the start, are logged as information.
         """
-        kind, before = _kind_of(message), (self.state[0], _kind_of(self.state[1]))
+        kind, before = _mask_numbers(message), (self.state[0], _mask_numbers(self.state[1]))
         self.state = (level, message)
         if (level, kind) != before:
             self._log_rarely(kind, OK if expected else level, message)
@@ -227,10 +227,10 @@ class LidarNode(Node):
 
     def _log_rarely(self, kind: str, level: bytes, message: str) -> None:
         """Log a problem at most once in LOG_PERIOD_S, and an OK state unless it was logged last, so
-        that the log always ends with the present state."""
+        that the log always ends with the current state."""
         now = monotonic()
         if (kind != self._last_logged if level == OK else
-                now - self._logged.get(kind, -LOG_PERIOD_S) >= LOG_PERIOD_S):
+            now - self._logged.get(kind, -LOG_PERIOD_S) >= LOG_PERIOD_S):
             if len(self._logged) > MAX_LOGGED_KINDS:
                 self._logged.clear()
             self._logged[kind], self._last_logged = now, kind
@@ -351,7 +351,7 @@ class MessageInput:
         self.subscription = None
 
 
-def _kind_of(message: str) -> str:
+def _mask_numbers(message: str) -> str:
     """Return the message with all numbers replaced by 0."""
     return re.sub(r"\d[\d.,e+-]*", "0", message)
 

@@ -32,7 +32,7 @@ class SensorCheck:
 
     def read_frame(self, msg: Any, with_intensity: bool = False
                    ) -> tuple[PointCloud, np.ndarray, Any]:
-        """Convert a cloud to a cropped frame, levelled if there is a base_frame.
+        """Convert a cloud to a cropped frame, in the level frame if there is a base_frame.
 
         Args:
             msg: the cloud.
@@ -40,20 +40,20 @@ class SensorCheck:
 
         Returns:
             The frame; the indices (N,) of its points in the cloud; and the parameters of the node,
-            adapted to a cropped and levelled frame.
+            adapted to the cropped frame.
         """
         params = self.node.params
         reads_intensity = with_intensity or params.ground.method == "patchwork"
         frame, indices = to_point_cloud(
             msg, params.input.intensity_max if reads_intensity else None, self.scale)
-        placing = self.node.transforms.placing(msg.header)
-        params = self.node.transforms.with_mounting(params, placing)
+        placement = self.node.transforms.find_placement(msg.header)
+        params = self.node.transforms.with_mounting(params, placement)
         self.node.counts.pop("cropped", None)
         if params.crop.enabled:
-            kept, frame = self.node.transforms.crop_frame(frame, params.crop, placing)
+            kept, frame = self.node.transforms.crop_frame(frame, params.crop, placement)
             self.node.counts["cropped"] = len(indices) - len(kept)
             indices, params = indices.take(kept), replace(params, crop=CropParams())
-        return placing.level_frame(frame), indices, params
+        return placement.level_frame(frame), indices, params
 
     def find_problem(self, frame: PointCloud, params: Any) -> str | None:
         """Return what contradicts the parameters of read_frame(), with the remedy, or None."""

@@ -41,7 +41,8 @@ class Stop:
         # A descriptor, because a thread in sigwait(3) does not block the signals.
         mask = sum(1 << number - 1 for number in signals).to_bytes(128, "little")  # sigset_t
         arrived, loaded = ctypes.CDLL(None).signalfd(-1, mask, os.O_CLOEXEC), threading.Event()
-        listener = threading.Thread(target=_listen, args=(arrived, loaded, pipe), daemon=True)
+        listener = threading.Thread(target=_relay_first_signal, args=(arrived, loaded, pipe),
+                                    daemon=True)
         listener.start()
         from lidar_perception.nodes import guard  # takes seconds, as it imports NumPy and Numba
         loaded.set()
@@ -74,7 +75,7 @@ class Stop:
         os.kill(os.getpid(), signal.SIGTERM)  # wakes the guard, if no signal has
 
 
-def _listen(arrived: int, loaded: threading.Event, pipe: int) -> None:
+def _relay_first_signal(arrived: int, loaded: threading.Event, pipe: int) -> None:
     """Pass the first signal to the pipe until the guard is loaded."""
     while not loaded.is_set():
         if select.select([arrived], [], [], POLL_PERIOD_S)[0]:

@@ -34,7 +34,7 @@ class TrackOutputs:
 
     Args:
         node: the node that publishes.
-        params: returns the present parameters with the groups tracking and ego.
+        params: returns the current parameters with the groups tracking and ego.
         clouds: the node subscribes to clouds, see EgoInput.
     """
 

@@ -60,7 +60,7 @@ class Transforms:
         self.tree, self.odometry = TransformTree(), TransformTree()
         self.base_frame = params.base_frame.lstrip("/")
         self.target_frame = getattr(params, "target_frame", "").lstrip("/")
-        self.carrier = self.odometry_frame = ""  # child frame and frame of the odometry
+        self.odometry_child = self.odometry_frame = ""  # child frame and frame of the odometry
         self.odometry_ns: int | None = None  # stamp of the last one
         self.odometry_arrival = self.ignored_arrival = -inf  # monotonic
         self.more_needs: list[Callable[[Any], str | None]] = []  # what else a header waits for
@@ -68,7 +68,7 @@ class Transforms:
         self.problem_by_source: dict[str, str] = {}  # problems by the parameter that causes them
         self.diagnostic_values: dict[str, Any] = {}
         self._last: tuple[tuple[str, int], Placement] = (("", -1), Placement(""))
-        self._connected: set[tuple[str, str]] = set()  # pairs of frames that have been connected
+        self._connected_pairs: set[tuple[str, str]] = set()  # frames seen connected
         self._has_tf_subscription = self._has_odometry_subscription = False
         self._installed = has_tf()
         if self._installed:
@@ -116,19 +116,19 @@ class Transforms:
         is used as long as it arrives."""
         now, child, frame = (monotonic(), msg.child_frame_id.lstrip("/"),
                              msg.header.frame_id.lstrip("/"))
-        if (child, frame) != (self.carrier, self.odometry_frame):
+        if (child, frame) != (self.odometry_child, self.odometry_frame):
             if now - self.odometry_arrival < ODOMETRY_TIMEOUT_S:
                 self.ignored_arrival = now
                 self.problem_by_source["odometry"] = (
                     f"two odometries on {self.node.resolve_topic_name('~/input/odometry')}: that "
-                    f"of '{child}' in '{frame}' is ignored, that of '{self.carrier}' in "
+                    f"of '{child}' in '{frame}' is ignored, that of '{self.odometry_child}' in "
                     f"'{self.odometry_frame}' is used; publish them on separate topics")
                 return
             self.odometry = TransformTree()
         add_odometry(self.odometry, msg)
         if now - self.ignored_arrival > ODOMETRY_TIMEOUT_S:
             self.problem_by_source.pop("odometry", None)
-        self.carrier, self.odometry_frame, self.odometry_arrival = child, frame, now
+        self.odometry_child, self.odometry_frame, self.odometry_arrival = child, frame, now
         self.odometry_ns = self.node.counts["last_pose_ns"] = to_ns(msg.header.stamp)
         self._clear_cache()
 
@@ -165,9 +165,10 @@ class Transforms:
         try:
             self.tree.lookup(frame, frame_id, stamp)
         except MissingTransform as error:
-            is_new = (frame, frame_id) not in self._connected and "TF" not in self.problem_by_source
+            is_new = ((frame, frame_id) not in self._connected_pairs
+                      and "TF" not in self.problem_by_source)
             raise MissingTransform(str(error), error.late or is_new) from None
-        self._connected.add((frame, frame_id))
+        self._connected_pairs.add((frame, frame_id))
 
     def _sweep_duration(self, cloud: Any) -> float:
         """Return the time from the stamp to the last point of a cloud, in seconds.
@@ -182,16 +183,16 @@ class Transforms:
             self.sweep = float(seconds[np.isfinite(seconds)].max(initial=0.0))
         return self.sweep
 
-    def placing(self, header: Any) -> Placement:
+    def find_placement(self, header: Any) -> Placement:
         """Return the placement of a cloud with this header."""
         key = header.frame_id, to_ns(header.stamp)
         if not (self.base_frame or self.target_frame or self.node.node_params.input.ahead):
             return Placement(header.frame_id)
         if self._last[0] != key:
-            self._last = key, self._placing(*key)
+            self._last = key, self._compute_placement(*key)
         return self._last[1]
 
-    def _placing(self, frame_id: str, stamp_ns: int) -> Placement:
+    def _compute_placement(self, frame_id: str, stamp_ns: int) -> Placement:
         base = self._look_up("base_frame", self.base_frame, frame_id, stamp_ns)
         if base is not None and not 0.0 <= base[2, 3] <= 50.0:
             self.problem_by_source["base_frame"] = (
@@ -226,21 +227,21 @@ class Transforms:
             self.problem_by_source[what] = f"{what} '{frame}': {error}; {fallback}"
             return None
 
-    def with_mounting(self, params: Any, placing: Placement) -> Any:
-        """Return the parameters of a node for a frame that placing has levelled.
+    def with_mounting(self, params: Any, placement: Placement) -> Any:
+        """Return the parameters of a node for a frame transformed by a placement.
 
         The sensor height comes from TF, or from params.ground.sensor_pose without a base_frame.
         """
         height = params.ground.sensor_pose.height
-        if placing.base is not None:
-            height = float(placing.base[2, 3])
+        if placement.base is not None:
+            height = float(placement.base[2, 3])
             self.diagnostic_values["mount"] = f"{height:.3f} m above '{self.base_frame}'"
-        if placing.base is not None or placing.level is not None:
+        if placement.base is not None or placement.level is not None:
             params = replace(params, ground=replace(
                 params.ground, sensor_pose=SensorPoseParams(height=height)))
         return params
 
-    def crop_frame(self, frame: PointCloud, crop: CropParams, placing: Placement
+    def crop_frame(self, frame: PointCloud, crop: CropParams, placement: Placement
                    ) -> tuple[np.ndarray, PointCloud]:
         """Crop a frame, see robot.crop.crop_frame.
 
@@ -248,7 +249,7 @@ class Transforms:
         """
         self.problem_by_source.pop("crop.body", None)
         if crop.body and self.base_frame:
-            if placing.base is None:
+            if placement.base is None:
                 self.problem_by_source["crop.body"] = (
                     "crop.body is not cropped: the pose in base_frame is unknown")
                 crop = replace(crop, body=())
@@ -256,10 +257,11 @@ class Transforms:
                 self.problem_by_source["crop.body"] = (
                     f"crop.body ends {-crop.body[5]:.2f} m below the ground of '{self.base_frame}'"
                     "; give it in that frame, as the file of `setup` does")
-        level, pose = placing.level, None if placing.base is not None else self._configured_pose()
+        level = placement.level
+        pose = None if placement.base is not None else self._configured_pose()
         if level is None and pose is not None:
             level = find_level_transform(pose)
-        return crop_frame(frame, crop, placing.base, level)
+        return crop_frame(frame, crop, placement.base, level)
 
     def to_level(self, header: Any, frame_id: str) -> np.ndarray:
         """Return the (4, 4) transform from a frame to the level frame of a cloud.
@@ -270,7 +272,7 @@ class Transforms:
         if frame_id not in ("", header.frame_id):
             self.subscribe_to_tf()
         pose = self.tree.lookup(header.frame_id, frame_id or header.frame_id, to_ns(header.stamp))
-        level = self.placing(header).level
+        level = self.find_placement(header).level
         return pose if level is None else level @ pose
 
     # Motion of the sensor
@@ -296,7 +298,7 @@ class Transforms:
             return self.tree.lookup_many(fixed_frame, frame_id, at, max_gap)
         if frame_id.lstrip("/") == self.odometry_frame != "":  # it does not move
             return np.tile(np.eye(4), (len(at), 1, 1))
-        return self.odometry_poses(at, max_gap) @ self._on_carrier(frame_id, at, max_gap)
+        return self.odometry_poses(at, max_gap) @ self._find_child_poses(frame_id, at, max_gap)
 
     def odometry_poses(self, at: np.ndarray, max_gap: float | None = None) -> np.ndarray:
         """Return the (M, 4, 4) poses of the child frame of the odometry at times (M,) ns.
@@ -310,34 +312,35 @@ class Transforms:
         try:
             return self.odometry.lookup_many(FIXED, MOVING, at, max_gap)
         except MissingTransform as error:
-            reason = str(error).replace(FIXED, self.odometry_frame).replace(MOVING, self.carrier)
+            reason = str(error).replace(FIXED, self.odometry_frame)
+            reason = reason.replace(MOVING, self.odometry_child)
             raise MissingTransform(f"{self.node.resolve_topic_name('~/input/odometry')}: {reason}",
                                    error.late) from None
 
-    def _on_carrier(self, frame_id: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
+    def _find_child_poses(self, frame_id: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
         """Return the (M or 1, 4, 4) poses of a frame in the child frame of the odometry."""
-        if frame_id.lstrip("/") == self.carrier:
+        if frame_id.lstrip("/") == self.odometry_child:
             return np.eye(4)[None]
-        if not self.carrier:
+        if not self.odometry_child:
             topic = self.node.resolve_topic_name("~/input/odometry")
             raise MissingTransform(f"the odometry on {topic} has an empty child_frame_id; "
                                    "set it in the publisher")
         try:
-            return self.tree.lookup_many(self.carrier, frame_id, at, max_gap)
+            return self.tree.lookup_many(self.odometry_child, frame_id, at, max_gap)
         except MissingTransform as error:
             self.subscribe_to_tf()
-            pose = self._configured_pose() if self.carrier == self.base_frame else None
+            pose = self._configured_pose() if self.odometry_child == self.base_frame else None
             if pose is None:
-                raise MissingTransform(f"the odometry is of '{self.carrier}': {error}",
+                raise MissingTransform(f"the odometry is of '{self.odometry_child}': {error}",
                                        error.late) from None
             return pose[None]
 
-    def knows_motion_of(self, frame_id: str) -> bool:
+    def is_connected_to_odometry(self, frame_id: str) -> bool:
         """Return True if a frame is one of the odometry, or TF connects it with its child frame."""
-        if frame_id.lstrip("/") in (self.carrier, self.odometry_frame):
+        if frame_id.lstrip("/") in (self.odometry_child, self.odometry_frame):
             return True
         try:
-            self._on_carrier(frame_id, np.array([self.odometry_ns]), None)
+            self._find_child_poses(frame_id, np.array([self.odometry_ns]), None)
         except MissingTransform as error:
             return error.late
         return True
@@ -359,7 +362,7 @@ class Transforms:
         begin, counts = perf_counter(), self.node.counts
         self.problem_by_source.pop("deskew", None)
         try:
-            moved = self._moved(msg)
+            moved = self._move_points(msg)
         except InputError as error:
             self.problem_by_source["deskew"] = f"input.deskew: {error}; clouds are not deskewed"
             counts["not_deskewed"] = counts.get("not_deskewed", 0) + 1
@@ -368,11 +371,11 @@ class Transforms:
         self.diagnostic_values["deskew_ms"] = f"{(perf_counter() - begin) * 1e3:.1f}"
         return moved
 
-    def _moved(self, msg: Any) -> Any:
+    def _move_points(self, msg: Any) -> Any:
         frame, indices = to_point_cloud(msg)
         crop = getattr(self.node.params, "crop", None)
         if crop is not None and crop.enabled:
-            kept, frame = self.crop_frame(frame, crop, self.placing(msg.header))
+            kept, frame = self.crop_frame(frame, crop, self.find_placement(msg.header))
             indices = indices.take(kept)
 
         def poses(at: np.ndarray) -> np.ndarray:

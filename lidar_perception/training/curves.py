@@ -12,7 +12,7 @@ PENALTY = 1.0  # chosen on held-out streets
 
 
 def compute_ramps(values: np.ndarray, knots: tuple[float, ...]) -> np.ndarray:
-    """Return how far each value (K,) is from one knot to the next: (K, len(knots) - 1), 0 .. 1.
+    """Return the position of each value (K,) between successive knots: (K, len(knots) - 1), 0 .. 1.
 
     NaN values give 0.
     """

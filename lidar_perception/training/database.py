@@ -52,7 +52,7 @@ class Database:
     def __len__(self) -> int:
         return len(self.boxes)
 
-    def points_of(self, i: int) -> np.ndarray:
+    def get_points(self, i: int) -> np.ndarray:
         """Return the (N, 4) points of an object, in the frame of its scene."""
         return self.points[self.first[i]:self.first[i + 1]]
 
@@ -97,7 +97,7 @@ def paste_objects(scene: TrainingScene, database: Database, params: AugmentParam
         for i in rng.permutation(candidates)[:max(MAX_TRIES * missing, 0)]:
             if missing == 0:
                 break
-            box, own = database.boxes[i], database.points_of(i)
+            box, own = database.boxes[i], database.get_points(i)
             if class_id == THING:
                 box, own = vary_boxed_thing(box, own, params, rng)
             pasted = _paste(box, own, points, boxes, free, low, high, rng)

@@ -205,7 +205,7 @@ def _write_state(path: Path, run: Run) -> None:
 def _next_batch(batches: Iterator[Any], path: Path, run: Run) -> Any:
     """Return the next batch. If a process that prepares them was killed, save the state first.
 
-    Only rank 0 saves, without waiting: the other processes may not have come this far.
+    Only rank 0 saves, without waiting: the other processes may be at an earlier step.
     """
     try:
         return next(batches)

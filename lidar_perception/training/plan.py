@@ -138,7 +138,7 @@ def _fit_any(hours: float, cores: int, speed: Speed, data: Data, given: Plan,
 
 
 def shorten_plan(plan: Plan, seconds: float, slowdown: float, speed: Speed, data: Data) -> Plan:
-    """Return the plan with as many of its steps as fit into the seconds that are left.
+    """Return the plan with as many steps as fit into the remaining time, in seconds.
 
     At least MIN_STEPS stay. slowdown: the machine is this many times slower than measured.
     """

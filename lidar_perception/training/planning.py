@@ -110,7 +110,7 @@ class Planner:
             "data.scans": plan.scans, "data.val_scans": plan.val_scans, **part})
 
     def _measure_speed(self) -> tuple[Speed, Sequence[Any], Sequence[Any]]:
-        """Return durations on this machine now, and the scene sources they were measured with."""
+        """Measure step durations on this machine; return them with the scene sources used."""
         params = limit_to_few_scans(self.params)
         sources, held_out = open_scenes(self.request, params, self.sensor)
         scenes, scan, scan_mb = _time_scans((*sources, *held_out))
@@ -122,7 +122,7 @@ class Planner:
         at_height = "" if height is None else f" at {height:g} m"
         scenes = " and ".join(text for count, text in (
             (plan.scans, f"{plan.scans} {params.scene} scans of {params.sensor} at "
-                         f"{self.sensor.height:g} m"),
+             f"{self.sensor.height:g} m"),
             (data.recorded, f"{data.recorded} recorded scenes{at_height}")) if count)
         part = self.trainer.reduced_range(params) if plan.part else {}
         region = f" up to {part['ahead']:g} m ahead and {part['aside']:g} m aside" if part else ""

@@ -45,7 +45,7 @@ class WeightAverage:
 
     @torch.no_grad()
     def update(self, module: nn.Module) -> None:
-        """Add the module's present weights. Integer buffers are copied."""
+        """Add the module's current weights. Integer buffers are copied."""
         self.updates += 1
         decay = min(self.decay, self.updates / (self.updates + 9))
         for mean, value in zip(self.module.state_dict().values(), module.state_dict().values()):

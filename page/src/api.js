@@ -4,7 +4,7 @@ import { say, sayError } from "./messages.js";
 import { addLiveFrame, applyEvent, changed, setDrive, setState, store } from "./store.js";
 
 const TOKEN = new URLSearchParams(location.search).get("token");
-export const PAGE = crypto.randomUUID();
+const PAGE = crypto.randomUUID();
 const RETRY_MS = 1000;
 const EVENT_TIMEOUT_MS = 1500; // without the event of an action for so long, the state is loaded
 

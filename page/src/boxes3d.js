@@ -75,7 +75,7 @@ function setFronts(boxes) {
 
 /** Positions of a track's last boxes in the coordinates of a frame; without poses, each in those of
  * its own frame. */
-export function trailOf(track, frame = store.frame) {
+function trailOf(track, frame = store.frame) {
   if (track.trails) return track.trails[frame] ?? []; // published by the tracker
   const { frames } = store.drive, here = frames[frame].pose, found = [];
   for (let i = Math.max(0, frame - TRAIL); i <= frame; i++) {

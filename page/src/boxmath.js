@@ -2,7 +2,7 @@
 
 const MIN_SIZE = 0.1; // metres
 
-export function wrap(angle) {
+function wrap(angle) {
   return angle - 2 * Math.PI * Math.floor((angle + Math.PI) / (2 * Math.PI));
 }
 

@@ -228,7 +228,7 @@ def one_walker(x: float) -> Database:
 def street_with(*walls: np.ndarray) -> TrainingScene:
     ground = wall(-1.73, (-15, 15), (0, 15), 0.1)[:, [2, 1, 0, 3]]
     return TrainingScene(np.concatenate([ground, *walls]), np.zeros((0, 7)), np.zeros(0, int),
-                 np.zeros(0, bool))
+                         np.zeros(0, bool))
 
 
 @given(seeds)
@@ -264,7 +264,7 @@ def test_posts_are_pasted_without_boxes():
     database = cut_objects(scene, ("Pedestrian",), 5)
     assert database.class_ids.tolist() == [PEDESTRIAN, THING]
     assert len(cut_objects(scene, ("Car",), 5)) == 0
-    box, own = database.boxes[1], database.points_of(1)
+    box, own = database.boxes[1], database.get_points(1)
     assert (own[:, 0] == 8).all() and len(own) > 0.8 * len(post)
     assert box[:2] == pytest.approx([8, 3], abs=0.05) and box[5] == pytest.approx(2.33, abs=0.1)
     params = replace(STILL, things=1, things_stretch=0, things_intensity=0, things_shine=0)
@@ -373,6 +373,6 @@ def test_database_file_round_trip_and_broken_file_is_named(tmp_path):
 def test_nothing_is_pasted_without_ground():
     database = join_databases([cut_objects(random_scene(k), ("Car",), 5) for k in range(4)])
     empty = TrainingScene(np.zeros((0, 4), np.float32), np.zeros((0, 7)), np.zeros(0, int),
-                  np.zeros(0, bool))
+                          np.zeros(0, bool))
     assert len(paste_objects(empty, database, AugmentParams(), *AREA,
-                            np.random.default_rng(0)).boxes) == 0
+                             np.random.default_rng(0)).boxes) == 0

@@ -87,7 +87,7 @@ class BagPlayer(LidarNode):
             self.create_service(SetRate, "~/set_rate", self._set_rate)
 
     def _select_topics(self) -> dict[str, str]:
-        """Return {topic in the bag: topic as played}."""
+        """Return the topic on which each topic of the bag is played."""
         for topic in self.params.topics:
             self.bag.require(topic)
         names = {t: t for t in (self.params.topics or self.bag.topics)}
@@ -115,7 +115,7 @@ class BagPlayer(LidarNode):
             raise InputError(f"{what}: '{name}' is not a topic name ({reason})") from None
 
     def _parse_wait_for(self) -> dict[str, int]:
-        """Return {topic: number of subscribers to wait for}."""
+        """Return the number of subscribers to wait for, by topic."""
         awaited = {}
         own = [self.names[t] for t in find_cloud_topics(self.bag.topics) if t in self.names]
         for rule in self.params.wait_for or own:
@@ -213,7 +213,7 @@ class BagPlayer(LidarNode):
         self._publish_latched()
         self.now_ns, self.anchor = self.start_ns, monotonic()
         for topic, stamp, data in self.bag.raw_messages(self.publishers_by_topic, self.start_ns,
-                                               self.stop_ns):
+                                                        self.stop_ns):
             if not self._wait_until(stamp, topic):
                 return
             if (played := self._convert(topic, data)) is None:

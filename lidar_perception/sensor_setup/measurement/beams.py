@@ -54,8 +54,8 @@ def find_beams(scans: Sequence[Scan]) -> Beams | None:
     """Find the beams of a sensor that turns about its z axis.
 
     Returns:
-        The beams; None if there are none, as for a sensor whose pattern does not repeat, or in a
-        frame that is turned against the sensor.
+        The beams; None if none are found, for example with a non-repeating scan pattern, or if the
+        frame is rotated relative to the sensor.
     """
     for method, label in (("ring", _label_by_ring), ("order", _label_by_order),
                           ("elevation", _label_by_elevation)):

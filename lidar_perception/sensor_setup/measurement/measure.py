@@ -53,7 +53,7 @@ MIN_OUTDOOR_RANGE_M = 30.0  # if nothing is farther, the room limits the range a
 MAX_OWN_SPREAD = 0.01  # degrees between points of a beam, beyond which they have been moved
 MIN_MOTION_M = 0.1   # a robot that moved less stands still
 MIN_POSE_MOTION_M = 2.0  # by its poses, which drift while it stands
-PEOPLE_ELEVATIONS = (-15.0, 5.0)  # degrees: where people are seen and the beam distance counts
+PEOPLE_ELEVATIONS = (-15.0, 5.0)  # degrees of the beams that hit people
 
 
 class CloudSource(NamedTuple):
@@ -151,7 +151,7 @@ class SensorMeasurement:
 
     @property
     def elevation_step(self) -> float:
-        """Median degrees between beams where people are seen; NaN without beams."""
+        """Median spacing in degrees of the beams that hit people; NaN without beams."""
         if self.pattern.beams is None:
             return np.nan
         elevations = self.pattern.beams.elevations

@@ -113,7 +113,7 @@ def draw_images(scans: Sequence[np.ndarray], moves: bool) -> np.ndarray:
     """Draw points above the ground as images from above.
 
     Args:
-        scans: S arrays of levelled points (N, 3), whose z is the height above the ground.
+        scans: S arrays of points (N, 3) in the level frame, z = 0 on the ground.
         moves: The robot is known to move, so that cells occupied in most scans are left out.
 
     Returns:

@@ -79,7 +79,7 @@ def read_recorded_poses(poses: BagPoses | None, numbers: Sequence[int],
     mount = poses.find_mount(base) if base else None
     by_cloud = {}
     # Odometry without child_frame_id may be of another frame than the base.
-    is_nameless = poses.odometry and not poses.carrier
+    is_nameless = poses.odometry and not poses.odometry_child
     for number in () if is_nameless else numbers:
         pose = _find_base_pose(poses, int(stamps_ns[number]), mount if base else np.eye(4))
         if pose is not None:
@@ -92,9 +92,9 @@ def read_recorded_poses(poses: BagPoses | None, numbers: Sequence[int],
 
 
 def _find_base_pose(poses: BagPoses, stamp_ns: int, mount: np.ndarray | None) -> np.ndarray | None:
-    if poses.carrier == poses.base:
+    if poses.odometry_child == poses.base:
         try:
-            return poses.carrier_pose(stamp_ns)
+            return poses.odometry_pose(stamp_ns)
         except MissingTransform:
             return None
     pose = poses(stamp_ns)

@@ -50,8 +50,8 @@ def _check_beams(m: SensorMeasurement) -> list[str]:
     beams = pattern.beams
     if beams is None:
         return ["there are no beams about the z axis: the pattern does not repeat, clouds are "
-                "joined or moved, or their frame is turned against the sensor; sensor.yaml has a "
-                "grid of the same view instead; record the driver's own cloud if possible"]
+                "joined or moved, or their frame is rotated against the sensor; sensor.yaml has "
+                "a grid of the same view instead; record the driver's own cloud if possible"]
     warnings = []
     if pattern.model and len(beams.elevations) < find_sensor(pattern.model).rings:
         warnings.append(f"{len(beams.elevations)} of the {find_sensor(pattern.model).rings} beams "

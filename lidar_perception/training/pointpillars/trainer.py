@@ -99,7 +99,7 @@ class PointPillarsTrainer:
                 prepare, database=Path(folder) / OBJECTS if self.max_cuts(params) else None)
             step = measure_step(network, make_loss(reduced, device), lambda: [
                 prepare_pasted(scene, np.random.default_rng(0)) for scene in chosen],
-                params, device)
+                                params, device)
         proposer = PointPillarsProposer(TorchNetwork(network, str(device)), Header(self.config),
                                         str(device))
         detector = PointPillarsDetector(proposer, VALIDATION_PARAMS)
@@ -111,7 +111,7 @@ class PointPillarsTrainer:
 
     def make_cuts(self, params: PointPillarsTraining, sources: Sequence[Any],
                   held_out: Sequence[Any], cache: Path) -> Cuts:
-        """Return the objects of some scenes, which the seed draws."""
+        """Return the objects of some scenes, which are drawn with the seed."""
         ends = np.cumsum([0, *map(len, sources)])
         chosen = np.random.default_rng(params.seed).permutation(ends[-1])[:self.max_cuts(params)]
         cuts = [CutObjects(source, self.config.classes, params.data.min_points, cache / "objects")
