@@ -23,7 +23,7 @@ from benchmark.precision import Curve, curve_of, precisions
 from benchmark.tracking import Seen, Step, peer, tracker
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.seed_sources import make_automatic_source
-from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.candidates.seeds import load_seeds
 from lidar_perception.classes import DETECTED
 from lidar_perception.detectors.candidates import CandidateDetector
 from lidar_perception.detectors.contract import Detector
@@ -56,7 +56,7 @@ def detected(street: int, frames: int, people: float) -> Drive:
     """The first scans of a street and what each detector finds in them, weak detections too."""
     params = with_values(BEST, {"seed.source": "automatic"})
     detectors: dict[str, Detector] = {
-        "candidates": CandidateDetector(make_automatic_source(load_seed(), params),
+        "candidates": CandidateDetector(make_automatic_source(load_seeds(), params),
                                         FORWARD_CAMERA.camera(), params),
         **{name: open_detector(name, "cpu") for name in NETWORKS}}
     detectors = {name: each.with_min_score(LEAST) for name, each in detectors.items()}

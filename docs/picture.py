@@ -12,7 +12,7 @@ from PIL import Image, ImageSequence
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import make_fixed_source
-from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.candidates.seeds import load_seeds
 from lidar_perception.cli.main import cli
 from lidar_perception.clustering.cluster import cluster
 from lidar_perception.detectors.open import open_detector
@@ -88,7 +88,7 @@ def make(folder: Path = FOLDER) -> None:
     draw(folder / "scene.png", README, frame.xyz, color_by_cluster(ground, cluster_ids), found)
 
     # Default displays of the layouts: clusters, ground, detections and candidates.
-    segmented, candidates = find_candidates(frame, make_fixed_source(load_seed(
+    segmented, candidates = find_candidates(frame, make_fixed_source(*load_seeds(
         PipelineParams().seed.file)))
     draw(folder / "look.png", LOOK, segmented.xyz, color_by_cluster(
         segmented.ground, segmented.cluster_ids), found.followed_by(candidates.final))

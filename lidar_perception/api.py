@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.pipeline import find_candidates as run_pipeline
 from lidar_perception.candidates.seed_sources import make_automatic_source, make_click_source
-from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.candidates.seeds import load_seeds
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.params import CLUSTERING_METHODS, ClusteringParams
 from lidar_perception.data.frame import BOXES, Recording
@@ -153,7 +153,7 @@ def find_candidates(xyz: PointCloud | ArrayLike, *, click: ArrayLike | None = No
     """
     params = _set_params(BEST, {"view.enabled": False,
                                 "ground.sensor_pose.height": sensor_height, **(settings or {})})
-    seed = (make_automatic_source(load_seed(params.seed.file), params) if click is None else
+    seed = (make_automatic_source(load_seeds(params.seed.file), params) if click is None else
             make_click_source(np.asarray(click, float), params.seed))
     _, candidates = run_pipeline(xyz, seed, None, params, ground=ground, cluster_ids=cluster_ids)
     return candidates.final

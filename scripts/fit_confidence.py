@@ -73,7 +73,8 @@ def find_seed(job: tuple[str, int]) -> Seed | None:
     frame = open_recording(job[0]).frames[job[1]]
     try:
         segmented = segment_cloud(frame.load(), frame.camera(), BEST)
-        return make_truth_source(select_pedestrians(frame))(segmented)
+        seed, = make_truth_source(select_pedestrians(frame))(segmented)
+        return seed
     except InputError:
         return None
 

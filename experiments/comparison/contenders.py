@@ -16,7 +16,7 @@ from lidar_perception.candidates.seed_sources import (
     make_automatic_source,
     make_truth_source,
 )
-from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.candidates.seeds import load_seeds
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.base import NetworkDetector
@@ -158,7 +158,7 @@ def _make_name(detector: NetworkDetector | CustomDetector, used: Sequence[str]) 
 
 def _make_candidate_contenders(paper: PipelineParams, best: PipelineParams) -> list[Contender]:
     """Return STM-CPA with the paper's seed, and `best` with the automatic seed."""
-    automatic = make_automatic_source(load_seed(), best)
+    automatic = make_automatic_source(load_seeds(), best)
     return [_make_seeded("STM-CPA paper", paper, _find_labelled_seed),
             _make_seeded("STM-CPA best", best, _find_labelled_seed),
             _make_seeded("STM-CPA best, auto", best, lambda frame: automatic)]

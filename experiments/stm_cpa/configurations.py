@@ -28,7 +28,7 @@ from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import refine_segmented
 from lidar_perception.candidates.seed_sources import make_automatic_source
-from lidar_perception.candidates.seeds import Seed, load_seed
+from lidar_perception.candidates.seeds import Seed, load_seeds
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.data.frame import Frame
 from lidar_perception.param_fields import flatten, with_values
@@ -112,17 +112,17 @@ def _remember_segments(labelled: LabelledFrame) -> Callable[[PipelineParams], Se
 def _find_candidates(segmented: SegmentedCloud, labelled: LabelledFrame,
                      params: PipelineParams) -> ScoredBoxes:
     """Return the candidates of the last stage; none where there is no seed."""
-    def make_seed(_: SegmentedCloud) -> Seed:
+    def make_seeds(_: SegmentedCloud) -> tuple[Seed, ...]:
         if params.seed.source == "ground_truth":
-            return make_nearest_seed(segmented, labelled)
-        template = load_seed(params.seed.file)
+            return (make_nearest_seed(segmented, labelled),)
+        templates = load_seeds(params.seed.file)
         if params.seed.source == "automatic":
-            return make_automatic_source(template, params)(segmented)
-        return template
+            return make_automatic_source(templates, params)(segmented)
+        return templates
 
     stage = params.confidence if params.confidence.enabled else params.stm
     try:
-        found = refine_segmented(segmented, make_seed, with_values(params, ANY_SCORE)).final
+        found = refine_segmented(segmented, make_seeds, with_values(params, ANY_SCORE)).final
     except InputError:
         return ScoredBoxes(np.zeros((0, 7), np.float32), np.zeros(0), 0.0)
     return ScoredBoxes(found.boxes, found.scores, stage.threshold)

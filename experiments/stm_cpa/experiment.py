@@ -143,7 +143,7 @@ def measure_overlaps(found: np.ndarray, truth: np.ndarray) -> list[float]:
 
 
 def _refine(segmented: SegmentedCloud, seed: Seed, params: PipelineParams) -> Candidates:
-    return refine_clusters(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed, params)
+    return refine_clusters(segmented.xyz, segmented.cluster_ids, segmented.boxes, [seed], params)
 
 
 def _count_by_range(boxes: np.ndarray) -> list[int]:

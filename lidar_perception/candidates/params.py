@@ -91,8 +91,11 @@ class SeedParams(Params):
         "click: the cluster at /clicked_point. file: a saved template. automatic: the cluster of "
         "the frame that is most like a pedestrian, or the template where none is.",
         choices=SEED_SOURCES)
-    file: str = param("", "Template file for source 'file'; empty: the one that comes with the "
-                      "package.")
+    file: str = param("", "Template file for source 'file', or several with commas between them; "
+                      "empty: the one that comes with the package.")
+    bank: int = param(1, "Number of the last clicks whose seeds are kept for source 'click'. A "
+                      "cluster is compared with all seeds; the most similar one counts.", low=1,
+                      high=16)
     min_confidence: float = param(0.3, "For source 'automatic': a cluster less like a pedestrian "
                                     "than this is no seed.", low=0.0, high=1.0)
     click_radius: float = param(2.0, "A click takes the nearest cluster within this distance.",

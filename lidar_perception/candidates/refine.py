@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 
@@ -42,21 +43,24 @@ class Candidates:
         return Candidates(Detections.none(), Detections.none(), Detections.none())
 
 
-def refine_clusters(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, seed: Seed,
-                    params: PipelineParams = PipelineParams()) -> Candidates:
+def refine_clusters(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray,
+                    seeds: Sequence[Seed], params: PipelineParams = PipelineParams()) -> Candidates:
     """Find the candidates among clusters 1..K of points (N, 3).
 
-    labels (N,) are the points' cluster ids, boxes (K, 7) are snapped to the ground.
+    labels (N,) are the points' cluster ids, boxes (K, 7) are snapped to the ground. Of several
+    seeds the one that gives a cluster its highest score counts.
     """
     t0 = perf_counter()
-    kept = np.flatnonzero(select_by_height(boxes, seed.height, params.height))
+    fits = np.array([select_by_height(boxes, seed.height, params.height) for seed in seeds])
+    kept = np.flatnonzero(fits.any(axis=0))
+    fits = fits[:, kept]
     boxes = boxes[kept]
     floors = boxes[:, 2] - boxes[:, 5] / 2
     t1 = perf_counter()
-    template = seed.silhouette(params)
+    templates = [seed.silhouette(params) for seed in seeds]
     points, start = group_points(xyz, labels, kept + 1)
     images = draw_silhouettes(points, start, np.ones((len(kept), 1)), floors, params)
-    plain = compute_similarity(images, template, params.stm)
+    plain = np.array([compute_similarity(images, template, params.stm) for template in templates])
     t2 = perf_counter()
     ranges = np.hypot(boxes[:, 0], boxes[:, 1])
     scales = compute_cpa_scales(ranges, params.cpa)
@@ -65,19 +69,22 @@ def refine_clusters(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, seed
     if len(chosen):
         images = draw_silhouettes(*group_points(xyz, labels, kept[chosen] + 1), scales[chosen],
                                   floors[chosen], params)
-        final[chosen] = compute_similarity(images, template, params.stm)
+        for scores, template in zip(final, templates):
+            scores[chosen] = compute_similarity(images, template, params.stm)
     t3 = perf_counter()
     threshold = params.stm.threshold
     if params.confidence.enabled:
         threshold = params.confidence.threshold
         shape = compute_shape_features(points, start, boxes, params)
-        # The similarity of the seed's own cluster carries no information: it is always 1.
-        is_seed = find_seed_cluster(seed, points, start)
-        seed_confidence = 1.0 if seed.certain else compute_confidence(shape)
-        height_difference = shape["height_m"] - seed.height
-        plain, final = (np.where(is_seed, seed_confidence,
-                                 compute_confidence(shape, similarity, height_difference))
-                        for similarity in (plain, final))
+        for seed, *similarities in zip(seeds, plain, final):
+            # The similarity of the seed's own cluster carries no information: it is always 1.
+            is_seed = find_seed_cluster(seed, points, start)
+            seed_confidence = 1.0 if seed.certain else compute_confidence(shape)
+            height_difference = shape["height_m"] - seed.height
+            for scores in similarities:
+                scores[:] = np.where(is_seed, seed_confidence, compute_confidence(
+                    shape, scores, height_difference))
+    plain, final = (np.where(fits, scores, -np.inf).max(axis=0) for scores in (plain, final))
     t4 = perf_counter()
 
     def detections(scores: np.ndarray, accepted: np.ndarray) -> Detections:

@@ -119,6 +119,11 @@ def save_seed(seed: Seed, path: str | Path) -> None:
                                  "silhouette": rows}, indent=1))
 
 
+def load_seeds(paths: str = "") -> tuple[Seed, ...]:
+    """Read one or more templates, with commas between their paths, as load_seed() does."""
+    return tuple(load_seed(path.strip()) for path in paths.split(","))
+
+
 def load_seed(path: str | Path = "") -> Seed:
     """Read a template; an empty path reads the package's own, a simulated pedestrian.
 

@@ -68,7 +68,7 @@ def warm_up_candidates(params: PipelineParams, segmented: bool = False) -> None:
     cloud = _make_cloud()
     ids = np.arange(len(cloud)) // 200
     columns = dict(ground=ids < 3, cluster_ids=np.maximum(ids - 2, 0)) if segmented else {}
-    find_candidates(cloud, make_automatic_source(seed, params), CAMERA, params, **columns)
+    find_candidates(cloud, make_automatic_source([seed], params), CAMERA, params, **columns)
     if not segmented:
         _warm_up_tree(params.clustering)
 

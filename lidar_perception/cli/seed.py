@@ -57,7 +57,7 @@ def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, 
     segmented = segment_cloud(frame.load(), camera, params)
     source = (make_click_source(np.array(at), params.seed) if at is not None
               else make_truth_source(load_pedestrians(frame, params.view.enabled)))
-    template = source(segmented)
+    template, = source(segmented)
     save_seed(template, out)
     for row in to_pixels(template.silhouette(params))[::2]:
         console.print("".join(".#"[bit] for bit in row.astype(int)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -18,7 +18,7 @@ from lidar_perception.candidates.seed_sources import (
     make_click_source,
     make_truth_source,
 )
-from lidar_perception.candidates.seeds import Seed, load_seed
+from lidar_perception.candidates.seeds import Seed, load_seeds
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.nodes.graph import relative_name
 from lidar_perception.nodes.runtime import (
@@ -157,16 +157,16 @@ class SeedInput:
 
     def __init__(self, node: LidarNode, deliver: Callable[[Any, SeedSource], None]):
         self.node, self.deliver = node, deliver
-        self.click: Any = None
-        self.clicked_seed: Seed | None = None
-        self.loaded_template: tuple[str, Seed] | None = None
+        self.new_clicks: deque[Any] = deque()
+        self.clicked_seeds: tuple[Seed, ...] = ()
+        self.loaded_templates: tuple[str, tuple[Seed, ...]] | None = None
         self.matcher = StampMatcher(self._deliver_with_truth, on_drop=self._count_dropped)
         node.input("ground_truth", MARKERS, self._on_truth, RELIABLE)
         node.input(relative_name(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE,
                    private=False)
         node.inputs.append(self)
         if self.params.source in ("file", "automatic"):
-            self._load_template()  # reports a missing file before the first cloud
+            self._load_templates()  # reports a missing file before the first cloud
 
     def open(self) -> None:
         """Do nothing: the subscriptions of the node are opened by the node."""
@@ -183,19 +183,19 @@ class SeedInput:
         if self.params.source == "ground_truth":
             self.matcher.add_cloud(to_ns(msg.header.stamp), msg)
         elif self.params.source == "click":
-            self.deliver(msg, partial(self._make_clicked_seed, msg.header))
+            self.deliver(msg, partial(self._make_clicked_seeds, msg.header))
         else:
-            self.deliver(msg, self._make_file_seed)
+            self.deliver(msg, self._make_file_seeds)
 
-    def _load_template(self) -> Seed:
-        if self.loaded_template is None or self.loaded_template[0] != self.params.file:
-            self.loaded_template = (self.params.file, load_seed(self.params.file))
-        return self.loaded_template[1]
+    def _load_templates(self) -> tuple[Seed, ...]:
+        if self.loaded_templates is None or self.loaded_templates[0] != self.params.file:
+            self.loaded_templates = (self.params.file, load_seeds(self.params.file))
+        return self.loaded_templates[1]
 
-    def _make_file_seed(self, segmented: SegmentedCloud) -> Seed:
-        template = self._load_template()
-        return template if self.params.source == "file" else make_automatic_source(
-            template, self.node.params)(segmented)
+    def _make_file_seeds(self, segmented: SegmentedCloud) -> tuple[Seed, ...]:
+        templates = self._load_templates()
+        return templates if self.params.source == "file" else make_automatic_source(
+            templates, self.node.params)(segmented)
 
     def _on_truth(self, msg: Any) -> None:
         objects = from_marker_array(msg)
@@ -218,28 +218,42 @@ class SeedInput:
                                                   else transform_boxes(people, level)))
 
     def _on_click(self, msg: Any) -> None:
-        self.click, self.clicked_seed = msg, None
+        self.new_clicks.append(msg)
+        while len(self.new_clicks) > self.params.bank:
+            self.new_clicks.popleft()
 
-    def _make_clicked_seed(self, header: Any, segmented: SegmentedCloud) -> Seed:
-        if self.click is None:
+    def _make_clicked_seeds(self, header: Any, segmented: SegmentedCloud) -> tuple[Seed, ...]:
+        while self.new_clicks:
+            try:
+                seed = self._make_clicked_seed(self.new_clicks[0], header, segmented)
+            except InputError:
+                if len(self.new_clicks) == 1:  # reported until the next click
+                    raise
+            else:
+                self.clicked_seeds = (*self.clicked_seeds, seed)
+            self.new_clicks.popleft()
+        self.clicked_seeds = self.clicked_seeds[-self.params.bank:]
+        if not self.clicked_seeds:
             raise InputError("no seed yet: click a pedestrian (a PointStamped on "
                              f"{relative_name(CLICK)}, as RViz and Foxglove publish it)")
-        if self.clicked_seed is None:
-            p, frame_id = self.click.point, self.click.header.frame_id
-            try:
-                pose = self.node.transforms.to_level(header, frame_id)
-            except MissingTransform as error:
-                raise InputError(f"the clicked point is in frame '{frame_id}' but the cloud in "
-                                 f"'{header.frame_id}' ({error}); set that as the fixed frame and "
-                                 "click again") from None
-            point = transform_points(np.array([[p.x, p.y, p.z]]), pose)[0]
-            self.clicked_seed = make_click_source(point, self.params)(segmented)
-            self.node.get_logger().info(f"seed selected at ({p.x:.1f}, {p.y:.1f}, {p.z:.1f}), "
-                                        f"height {self.clicked_seed.height:.2f} m")
-        return self.clicked_seed
+        return self.clicked_seeds
+
+    def _make_clicked_seed(self, click: Any, header: Any, segmented: SegmentedCloud) -> Seed:
+        p, frame_id = click.point, click.header.frame_id
+        try:
+            pose = self.node.transforms.to_level(header, frame_id)
+        except MissingTransform as error:
+            raise InputError(f"the clicked point is in frame '{frame_id}' but the cloud in "
+                             f"'{header.frame_id}' ({error}); set that as the fixed frame and "
+                             "click again") from None
+        point = transform_points(np.array([[p.x, p.y, p.z]]), pose)[0]
+        seed, = make_click_source(point, self.params)(segmented)
+        self.node.get_logger().info(f"seed selected at ({p.x:.1f}, {p.y:.1f}, {p.z:.1f}), "
+                                    f"height {seed.height:.2f} m")
+        return seed
 
 
 def _raise_missing(reason: str) -> SeedSource:
-    def source(segmented: SegmentedCloud) -> Seed:
+    def source(segmented: SegmentedCloud) -> tuple[Seed, ...]:
         raise InputError(reason)
     return source

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from candidate_samples import GROUND_Z, PEOPLE, boxes_at, person, scene
 from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
 
 from lidar_perception.candidates.boxes import select_by_height, snap_to_ground
+from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.params import HeightParams, PipelineParams, SeedParams, StmParams
 from lidar_perception.candidates.pipeline import find_candidates, refine_segmented, segment_cloud
 from lidar_perception.candidates.refine import refine_clusters
@@ -21,6 +23,7 @@ from lidar_perception.candidates.seeds import Seed, seed_from_points
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.data.open import open_recording
 from lidar_perception.groups import group_points
+from lidar_perception.param_fields import with_values
 from lidar_perception.types import PEDESTRIAN, InputError, PointCloud
 
 seeds = st.integers(0, 2**32 - 1)
@@ -83,7 +86,7 @@ def with_threshold(threshold):
 
 def test_stages_are_subsets_of_the_first_stage():
     s = segment_cloud(PointCloud(scene()))
-    seed = make_truth_source(boxes_at(PEOPLE))(s)
+    seed, = make_truth_source(boxes_at(PEOPLE))(s)
     tall = select_by_height(s.boxes, seed.height, HeightParams())
     assert 3 < tall.sum() < len(s.boxes)
     for threshold in (0.0, 0.4, 0.7, 0.9, 1.0):
@@ -119,7 +122,7 @@ def test_augmentation_changes_scores_from_15_to_30_metres_only():
 
 def test_the_threshold_applies_to_each_stages_own_scores():
     s = segment_cloud(PointCloud(scene()))
-    seed = make_fixed_source(make_truth_source(boxes_at(PEOPLE))(s))
+    seed = make_fixed_source(*make_truth_source(boxes_at(PEOPLE))(s))
     everything = refine_segmented(s, seed, with_threshold(0.0))
     assert (everything.final.scores != everything.stage2.scores).any()
     scores = np.unique(np.concatenate([everything.stage2.scores, everything.final.scores]))
@@ -143,7 +146,7 @@ def test_people_are_found_and_other_objects_are_not():
 def test_refining_without_clusters_finds_no_candidates():
     seed = Seed(person(7, 2).astype(np.float32), -1.7, 1.7)
     xyz = np.ones((5, 3), np.float32)
-    found = refine_clusters(xyz, np.zeros(5, np.int32), np.zeros((0, 7), np.float32), seed)
+    found = refine_clusters(xyz, np.zeros(5, np.int32), np.zeros((0, 7), np.float32), [seed])
     for stage in (found.stage1, found.stage2, found.final):
         assert stage.boxes.shape == (0, 7) and stage.scores.shape == (0,)
     assert set(found.ms) == {"height", "stm", "cpa", "confidence"}
@@ -159,7 +162,7 @@ def test_the_seeds_own_cluster_passes_every_stage():
         s = segment_cloud(frame.load())
         click = make_click_source(truth[np.hypot(*truth[:, :2].T).argmin(), :3], SeedParams())
         try:
-            seed = click(s)
+            seed, = click(s)
         except InputError:
             continue
         found = refine_segmented(s, click, PipelineParams())
@@ -182,3 +185,19 @@ def test_candidates_keep_the_ids_of_a_foreign_clustering():
         found = refine_segmented(segment_cloud(frame, ground=s.ground, cluster_ids=ids), source)
         np.testing.assert_array_equal(found.final.boxes, expected.final.boxes)
         np.testing.assert_array_equal(found.clusters, foreign[expected.clusters - 1])
+
+
+@pytest.mark.parametrize("params", [with_threshold(0.0), with_values(BEST, {
+    "view.enabled": False, "confidence.threshold": 0.0, "height.tolerance": 0.3})])
+def test_bank_of_seeds_takes_the_best_score_of_each_cluster(params):
+    s = segment_cloud(PointCloud(scene()), params=params)
+    sizes = np.bincount(s.cluster_ids)[1:]
+    seeds = [seed_from_points(s.xyz[s.cluster_ids == k + 1], s.boxes[k])
+             for k in np.argsort(-sizes)[:4]]
+    best = {}
+    for seed in seeds:
+        alone = refine_segmented(s, make_fixed_source(seed), params)
+        for cluster, score in zip(alone.clusters.tolist(), alone.final.scores.tolist()):
+            best[cluster] = max(score, best.get(cluster, 0.0))
+    together = refine_segmented(s, make_fixed_source(*seeds), params)
+    assert dict(zip(together.clusters.tolist(), together.final.scores.tolist())) == best

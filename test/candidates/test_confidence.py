@@ -21,7 +21,11 @@ from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.params import PipelineParams, StmParams
 from lidar_perception.candidates.pipeline import refine_segmented, segment_cloud
 from lidar_perception.candidates.refine import refine_clusters
-from lidar_perception.candidates.seed_sources import make_automatic_source, make_truth_source
+from lidar_perception.candidates.seed_sources import (
+    make_automatic_source,
+    make_fixed_source,
+    make_truth_source,
+)
 from lidar_perception.candidates.seeds import find_seed_cluster, load_seed, seed_from_points
 from lidar_perception.candidates.silhouette import (
     COLUMNS,
@@ -242,11 +246,11 @@ def test_seed_confidence_is_1_if_certain_else_by_shape(certain):
     ids = np.repeat(np.int32([1, 2]), np.diff(start))
     params = with_values(BEST, {"confidence.threshold": 0.0})
     seed = seed_from_points(xyz[:start[1]], boxes[0], certain)
-    scores = refine_clusters(xyz, ids, boxes, seed, params).final.scores
+    scores = refine_clusters(xyz, ids, boxes, [seed], params).final.scores
     shape = compute_confidence(compute_shape_features(xyz, start, boxes, BEST))
     assert scores[0] == pytest.approx(1.0 if certain else shape[0], abs=1e-6)
     assert scores[1] == pytest.approx(refine_clusters(
-        xyz, ids, boxes, seed_from_points(xyz[:start[1]] + np.float32([0, 0.5, 0]), boxes[0]),
+        xyz, ids, boxes, [seed_from_points(xyz[:start[1]] + np.float32([0, 0.5, 0]), boxes[0])],
         params).final.scores[1], abs=0.05)
 
 
@@ -263,10 +267,10 @@ def test_stages_of_best_are_accepted_by_confidence():
     s = segment_cloud(PointCloud(np.concatenate([xyz, flat])), params=params)
     seed = seed_from_points(people[0] + np.float32([0, -6, 0]),
                             make_box(8.0)[0] + np.float32([0, -6, 0, 0, 0, 0, 0]))
-    all_ = refine_segmented(s, lambda _: seed, params).final
+    all_ = refine_segmented(s, make_fixed_source(seed), params).final
     assert len(all_) >= 3
     limit = float(np.sort(all_.scores)[-2:].mean())
-    some = refine_segmented(s, lambda _: seed,
+    some = refine_segmented(s, make_fixed_source(seed),
                             with_values(params, {"confidence.threshold": limit})).final
     assert 0 < len(some) < len(all_)
     assert sorted(some.scores) == sorted(all_.scores[all_.scores >= np.float32(limit)])
@@ -276,13 +280,13 @@ def test_automatic_seed_is_the_likeliest_cluster_or_template():
     template = load_seed()
     params = with_values(BEST, {"view.enabled": False})
     empty = segment_cloud(PointCloud(np.zeros((0, 3), np.float32)), params=params)
-    assert make_automatic_source(template, params)(empty) is template
+    assert make_automatic_source([template], params)(empty) == (template,)
     one = segment_cloud(PointCloud(np.concatenate([
         board(9.0, 0.55), np.float32([[x, y, FLOOR] for x in np.arange(3, 20, 0.4)
                                       for y in np.arange(-8, 8, 0.4)])])), params=params)
-    assert make_automatic_source(template, with_values(params, {"seed.min_confidence": 1.0}))(one) \
-        is template
-    own = make_automatic_source(template, with_values(params, {"seed.min_confidence": 0.0}))(one)
+    assert make_automatic_source([template], with_values(params, {"seed.min_confidence": 1.0}))(
+        one) == (template,)
+    own, = make_automatic_source([template], with_values(params, {"seed.min_confidence": 0.0}))(one)
     assert own is not template and np.hypot(*own.xyz[:, :2].mean(axis=0)) == pytest.approx(9, abs=1)
 
 

@@ -106,5 +106,5 @@ def test_the_automatic_seed_falls_back_to_the_template(xyz, min_confidence):
     params = with_values(PipelineParams(), {"seed.min_confidence": min_confidence,
                                             "clustering.dbscan.min_samples": 3})
     given = seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0])
-    assert make_automatic_source(given, params)(segment_cloud(PointCloud(xyz.astype(np.float32)),
-                                                              params=params)) is given
+    assert make_automatic_source([given], params)(segment_cloud(PointCloud(xyz.astype(np.float32)),
+                                                                params=params)) == (given,)

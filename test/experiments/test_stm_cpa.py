@@ -77,7 +77,7 @@ def refined(kitti):
 
 
 def refine(segmented, seed, params):
-    return refine_clusters(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed, params)
+    return refine_clusters(segmented.xyz, segmented.cluster_ids, segmented.boxes, [seed], params)
 
 
 def add_up(measured, *keys):

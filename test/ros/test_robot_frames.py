@@ -120,6 +120,24 @@ def test_candidates_of_a_tilted_sensor_are_those_of_a_level_one(start, tilt):
     np.testing.assert_allclose(tilted_one[:6], level[:6], atol=0.05)
 
 
+def test_seed_bank_keeps_the_last_clicks_and_skips_a_bad_one(start):
+    node = start(Perception, **WALKING, **{"seed.bank": 2})
+    cloud = message(walker_scene()[:, :3])
+
+    def click(*places):
+        for place in places:
+            node.seed._on_click(bag_message(
+                "geometry_msgs/msg/PointStamped", header=make_header(START, "lidar", bag_message),
+                point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", place)))))
+        give(node, cloud)
+        return len(node.seed.clicked_seeds)
+
+    person, nowhere = WALKER[:3].tolist(), [90.0, 90.0, 0.0]
+    assert click(nowhere) == 0
+    assert click(nowhere, person) == 1 and len(boxes_of(node)[0]) == 1
+    assert click(person, person) == click(person) == 2
+
+
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     path = tmp_path_factory.mktemp("weights") / "v4.safetensors"

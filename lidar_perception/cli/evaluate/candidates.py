@@ -73,7 +73,7 @@ def candidates(options: ScoringOptions, png: Path | None, params: PipelineParams
 def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> None:
     """Draw the frame with most pedestrians among those with candidates."""
     from lidar_perception.candidates.pipeline import find_candidates
-    from lidar_perception.candidates.seeds import load_seed
+    from lidar_perception.candidates.seeds import load_seeds
     from lidar_perception.rendering.colors import color_by_cluster
     from lidar_perception.rendering.files import write_png
     from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
@@ -82,12 +82,12 @@ def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> Non
     best = report.find_most_crowded()
     if best is None:
         return
-    template = None if params.seed.source == "ground_truth" else load_seed(params.seed.file)
+    templates = None if params.seed.source == "ground_truth" else load_seeds(params.seed.file)
     frame = next(frame for frame in recording if frame.name == best)
     truth = load_pedestrians(frame, params.view.enabled)
     scan = frame.load()
     segmented, found = find_candidates(
-        scan, make_seed_source(truth, template, params), frame.camera(), params
+        scan, make_seed_source(truth, templates, params), frame.camera(), params
     )
     stage = Stage.of(scan, params.ground.sensor_pose.height, params.view.enabled)
     write_png(png, draw_frame(

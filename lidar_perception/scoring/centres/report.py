@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -18,7 +18,7 @@ from lidar_perception.candidates.seed_sources import (
     make_fixed_source,
     make_truth_source,
 )
-from lidar_perception.candidates.seeds import Seed, load_seed
+from lidar_perception.candidates.seeds import Seed, load_seeds
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, find_range_bins
@@ -71,13 +71,13 @@ def measure_candidates(params: PipelineParams, recording: Recording
     partial(measure_candidates, params) is a Start of scoring.run.
     """
     warm_up()
-    template = None if params.seed.source == "ground_truth" else load_seed(params.seed.file)
-    return partial(measure_frame, params=params, template=template)
+    templates = None if params.seed.source == "ground_truth" else load_seeds(params.seed.file)
+    return partial(measure_frame, params=params, templates=templates)
 
 
 def measure_frame(frame: Frame, params: PipelineParams,
-                  template: Seed | None = None) -> CandidateResult | None:
-    """Run the pipeline on one frame with the seed of make_seed_source().
+                  templates: Sequence[Seed] | None = None) -> CandidateResult | None:
+    """Run the pipeline on one frame with the seeds of make_seed_source().
 
     Returns None for a frame without a pedestrian.
     """
@@ -86,7 +86,7 @@ def measure_frame(frame: Frame, params: PipelineParams,
         return None
     scan, camera = frame.load(), frame.camera()
     try:
-        _, found = find_candidates(scan, make_seed_source(truth, template, params), camera, params)
+        _, found = find_candidates(scan, make_seed_source(truth, templates, params), camera, params)
     except InputError as error:  # no seed, or no camera: this frame has no candidates
         return CandidateResult(truth, collect_boxes(Candidates.none()), {},
                                f"{frame.name}: {error}")
@@ -99,18 +99,18 @@ def collect_boxes(candidates: Candidates) -> dict[str, np.ndarray]:
 
 
 def make_seed_source(
-    truth: np.ndarray, template: Seed | None, params: PipelineParams
+    truth: np.ndarray, templates: Sequence[Seed] | None, params: PipelineParams
 ) -> SeedSource:
-    """Make the source of a frame's seed.
+    """Make the source of a frame's seeds.
 
-    Without a template the seed is a true pedestrian, truth (M, 7), as in the paper; otherwise
+    Without templates the seed is a true pedestrian, truth (M, 7), as in the paper; otherwise
     params decide.
     """
-    if template is None:
+    if templates is None:
         return make_truth_source(truth)
     if params.seed.source == "automatic":
-        return make_automatic_source(template, params)
-    return make_fixed_source(template)
+        return make_automatic_source(templates, params)
+    return make_fixed_source(*templates)
 
 
 @dataclass
