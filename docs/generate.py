@@ -1,8 +1,6 @@
-"""Makes docs/reference/nodes/*.md from the parameter dataclasses, config/best.param.yaml from
-configurations.py, and those of the detectors with a network from their parameters:
-python docs/generate.py
+"""Generate docs/reference/nodes/*.md and config/*.param.yaml from parameters: docs/generate.py
 
-test/test_docs.py holds that the pages are up to date and the topics those of the running nodes.
+test/test_docs.py checks that the pages are up to date and list the topics of the running nodes.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ FOLDER = Path(__file__).parent / "reference" / "nodes"
 CLOUD, MARKERS = "sensor_msgs/PointCloud2", "visualization_msgs/MarkerArray"
 STRING_TIMES = "std_msgs/Float64"
 
-# Parameters that users need first, in this order; a node's page folds all others.
+# Most important parameters, in this order; the pages of nodes fold all others.
 FIRST = (
     "bag", "topics", "rate", "loop", "wait_for", "follow", "file", "stages",
     "fused.scores.pedestrian", "fused.scores.car", "fused.scores.cyclist", "fused.range",
@@ -44,30 +42,30 @@ FIRST = (
 CAMERA_IN = [
     ("~/input/camera_info", "sensor_msgs/CameraInfo", "P and the image size; latched. Only needed "
      "with `view.enabled`."),
-    ("~/input/extrinsics", "geometry_msgs/TransformStamped", "The camera in the LiDAR frame or the "
-     "other way round; latched. TF is asked too where tf2_msgs is installed."),
+    ("~/input/extrinsics", "geometry_msgs/TransformStamped", "Pose of the camera in the LiDAR "
+     "frame or vice versa; latched. TF is used too if tf2_msgs is installed."),
 ]
 SEED_IN = [
     ("~/input/ground_truth", MARKERS, "Labels, for `seed.source` ground_truth; matched to the "
      "cloud by header.stamp."),
     ("clicked_point", "geometry_msgs/PointStamped", "A point on a pedestrian, for `seed.source` "
-     "click, in the frame of the cloud or, with TF, in any that is connected with it."),
+     "click, in the frame of the cloud or, with TF, in any connected frame."),
 ]
 ROBOT_IN = [
-    ("~/input/odometry", "nav_msgs/Odometry", "How the robot moves, for `input.deskew` "
-     "odometry, and where there is a tracker for `ego.source` auto and odometry."),
-    ("/tf, /tf_static", "tf2_msgs/TFMessage", "Where tf2_msgs is installed; /tf only with "
+    ("~/input/odometry", "nav_msgs/Odometry", "Motion of the robot, for `input.deskew` odometry, "
+     "and with a tracker for `ego.source` auto and odometry."),
+    ("/tf, /tf_static", "tf2_msgs/TFMessage", "If tf2_msgs is installed; /tf only with "
      "`base_frame`, `target_frame`, `input.deskew` or `ego.source` tf, a click, or a tracker "
      "without odometry."),
 ]
-DETECTIONS_3D = ("~/output/detections_3d", "vision_msgs/Detection3DArray", "The same, where "
+DETECTIONS_3D = ("~/output/detections_3d", "vision_msgs/Detection3DArray", "The same, if "
                  "vision_msgs is installed.")
 TRACKS_OUT = [
-    ("~/output/tracks", MARKERS, "Tracks: boxes whose ids stay, with score, velocity and "
-     "probability of motion in the text; in the namespaces `velocity`, `number` and `trail` an "
-     "arrow, a text and the way of each. In the frame of the detections."),
+    ("~/output/tracks", MARKERS, "Tracks: boxes with persistent ids, and score, velocity and "
+     "probability of motion in the text. The namespaces `velocity`, `number` and `trail` have an "
+     "arrow, a number and the path of each track. In the frame of the detections."),
     ("~/output/tracks_3d", "vision_msgs/Detection3DArray", "The same with ids and covariances, "
-     "where vision_msgs is installed."),
+     "if vision_msgs is installed."),
 ]
 BOXES_OUT = [
     ("~/output/detections", MARKERS, "Boxes with class and score; an empty array still carries the "
@@ -78,50 +76,50 @@ CANDIDATES_OUT = [
     ("~/output/detections", MARKERS, "The candidates (STM + CPA); an empty array still carries the "
      "stamp."),
     DETECTIONS_3D,
-    ("~/debug/stage1", MARKERS, "Clusters of the seed's height; made only while subscribed."),
-    ("~/debug/stage2", MARKERS, "After STM without CPA; made only while subscribed."),
+    ("~/debug/stage1", MARKERS, "Clusters of the seed's height; published only while subscribed."),
+    ("~/debug/stage2", MARKERS, "After STM without CPA; published only while subscribed."),
     ("~/debug/height_ms, stm_ms, cpa_ms, confidence_ms", STRING_TIMES, "Time of each "
      "step; perception has view_ms, ground_ms, clustering_ms and boxes_ms too."),
 ]
 ALWAYS_OUT = [
-    ("~/debug/processing_time_ms", STRING_TIMES, "Time of the work on one cloud."),
-    ("/diagnostics", "diagnostic_msgs/DiagnosticArray", "Once a second and at every change: state, "
+    ("~/debug/processing_time_ms", STRING_TIMES, "Processing time of one cloud."),
+    ("/diagnostics", "diagnostic_msgs/DiagnosticArray", "Once a second and on every change: state, "
      "reason, counts, rate, lost and dropped clouds, subscribers of the outputs."),
 ]
-MANAGED_OUT = [("~/transition_event", "lifecycle_msgs/TransitionEvent", "Each change of the state, "
-                "see [lifecycle](../../how-to/lifecycle.md).")]
+MANAGED_OUT = [("~/transition_event", "lifecycle_msgs/TransitionEvent", "State changes, see "
+                "[lifecycle](../../how-to/lifecycle.md).")]
 MANAGED_SERVICES = [
     ("~/change_state", "lifecycle_msgs/ChangeState", "Configure, activate, deactivate, clean up, "
      "shut down."),
-    ("~/get_state", "lifecycle_msgs/GetState", "And the others of a managed node."),
+    ("~/get_state", "lifecycle_msgs/GetState", "And the other services of a managed node."),
 ]
-OBSTACLES_OUT = ("~/output/obstacles", CLOUD, "x y z, and intensity where the cloud has one, of "
-                 "the points that are no ground and within the heights of `obstacles`, for a "
-                 "costmap ([nav2](../../how-to/nav2.md)); made only while subscribed.")
+OBSTACLES_OUT = ("~/output/obstacles", CLOUD, "x y z, and intensity if the cloud has one, of the "
+                 "points that are not ground and within the heights of `obstacles`, for a "
+                 "costmap ([nav2](../../how-to/nav2.md)); published only while subscribed.")
 COLUMNS = "columns `ground` (uint8, 1 = ground) and `in_view` (uint8, 1 = processed)"
 
 PAGES: dict[str, dict[str, Any]] = {
     "ground_segmentation": dict(
         params=params.GroundNodeParams(),
-        what="Marks the ground points of a cloud, by one plane, by Patchwork++ or by a cloth"
-             " simulation (`ground.method`). Warns if the sensor is mounted at another "
-             "height than `sensor_pose` says, and if the scale of the intensity does not "
-             "fit.",
+        what="Marks the ground points of a cloud with one plane, Patchwork++ or a cloth "
+             "simulation (`ground.method`). Warns if the height of the sensor differs from "
+             "`sensor_pose`, or if the scale of the intensity does not fit.",
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape."), *CAMERA_IN],
         outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS}."),
-                 ("~/output/ground", CLOUD, "Ground points only; made only while subscribed."),
-                 ("~/output/nonground", CLOUD, "The other points in view; likewise."),
+                 ("~/output/ground", CLOUD, "Ground points; published only while subscribed."),
+                 ("~/output/nonground", CLOUD, "The other points in view; published only while "
+                  "subscribed."),
                  OBSTACLES_OUT]),
     "clustering": dict(
         params=params.ClusteringNodeParams(),
         what="Clusters the points that are not ground: distance-aware DBSCAN, exact, or "
              "adaptive Euclidean clustering (`clustering.method`).",
-        inputs=[("~/input/points", CLOUD, "With column `ground`; without it everything is "
-                 "clustered and a diagnostic says so.")],
+        inputs=[("~/input/points", CLOUD, "With column `ground`; without it all points are "
+                 "clustered and /diagnostics reports it.")],
         outputs=[("~/output/points", CLOUD, "The same cloud with the column `cluster_id` (uint32, "
                   "0 = none)."),
                  ("~/output/boxes", MARKERS, "Cluster boxes, down to the ground; the text has "
-                  "`size_class` by the diagonal. Made only while subscribed.")]),
+                  "`size_class` by the diagonal. Published only while subscribed.")]),
     "candidate_refinement": dict(
         params=params.RefinementNodeParams(),
         what="Finds pedestrian candidates among clusters: ground snapping, height filter, "
@@ -135,23 +133,23 @@ PAGES: dict[str, dict[str, Any]] = {
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape."), *CAMERA_IN,
                 *SEED_IN],
         outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS} and `cluster_id`; "
-                  "made only while subscribed."),
-                 ("~/output/boxes", MARKERS, "Cluster boxes; made only while subscribed."),
+                  "published only while subscribed."),
+                 ("~/output/boxes", MARKERS, "Cluster boxes; published only while subscribed."),
                  OBSTACLES_OUT,
                  *CANDIDATES_OUT]),
     "pointpillars_detector": dict(
         params=DetectorParams(),
         what="Detects cars, pedestrians and cyclists with PointPillars and the four versions"
              " of EG-PointPillars ([how](../../explanation/pointpillars.md)). Loads and "
-             "warms up before it subscribes. Without weights it says so in a diagnostic and "
-             "publishes nothing. Warns if nothing can be found (the cloud is out of range, "
-             "has no intensity, all of it is ground ...), if CUDA is asked for and missing "
-             "or out of memory, and if height or intensity do not fit; where every score is "
-             "below its threshold the diagnostic has the best ones. Files: "
+             "warms up before it subscribes. Without weights it publishes nothing and reports "
+             "the reason on /diagnostics. Warns if nothing can be found (the cloud is out of "
+             "range, has no intensity, is all ground ...), if CUDA is selected but missing or "
+             "out of memory, and if height or intensity do not fit. If all scores are below "
+             "their thresholds, /diagnostics has the best ones. Files: "
              "`launch/pointpillars.launch.py`, `config/pointpillars.param.yaml`.",
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape. The columns "
-                 "`ground` and `cluster_id` are used where they are there; what else the version "
-                 "needs is computed.")],
+                 "`ground` and `cluster_id` are used if present, otherwise computed if the version "
+                 "needs them.")],
         outputs=[*BOXES_OUT,
                  ("~/debug/preprocess_ms, experts_ms, network_ms, postprocess_ms", STRING_TIMES,
                   "Time of each step.")]),
@@ -159,49 +157,47 @@ PAGES: dict[str, dict[str, Any]] = {
         params=PointNetDetectorParams(),
         what="Detects cars, pedestrians and cyclists among the clusters of the whole cloud: "
              "each is classified and gets a box ([how](../../explanation/pointnet.md)). "
-             "Loads and warms up before it subscribes. Without weights it says so in a "
-             "diagnostic and publishes nothing. Warns if nothing can be found (no clusters, "
-             "all of them too small, no intensity ...), if CUDA is asked for and missing or "
-             "out of memory, and if height or intensity do not fit; where every score is "
-             "below its threshold the diagnostic has the best ones. Files: "
+             "Loads and warms up before it subscribes. Without weights it publishes nothing "
+             "and reports the reason on /diagnostics. Warns if nothing can be found (no "
+             "clusters, only small clusters, no intensity ...), if CUDA is selected but missing "
+             "or out of memory, and if height or intensity do not fit. If all scores are below "
+             "their thresholds, /diagnostics has the best ones. Files: "
              "`launch/pointnet.launch.py`, `config/pointnet.param.yaml`.",
-        inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape. The column "
-                 "`cluster_id` is used where it is there, or else the column `ground`; what is "
-                 "missing is computed.")],
+        inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape. The columns "
+                 "`cluster_id` and `ground` are used if present, otherwise computed.")],
         outputs=[*BOXES_OUT,
                  ("~/debug/preprocess_ms, ground_ms, clustering_ms, network_ms, postprocess_ms",
                   STRING_TIMES, "Time of each step.")]),
     "fused_detector": dict(
         params=FusedDetectorParams(),
         what="Detects cars, pedestrians and cyclists: PointPillars proposes boxes, "
-             "silhouettes and PointNet judge them, and the score is the probability that the"
-             " object is there ([how](../../explanation/fused.md)). Loads and warms up "
-             "before it subscribes. Without weights it reports that in /diagnostics and "
-             "publishes nothing. It warns as pointpillars_detector does. Files: "
+             "silhouettes and PointNet classify them, and the score is the probability that the"
+             " object exists ([how](../../explanation/fused.md)). Loads and warms up before it "
+             "subscribes. Without weights it publishes nothing and reports the reason on "
+             "/diagnostics. It has the same warnings as pointpillars_detector. Files: "
              "`launch/fused.launch.py`, `config/fused.param.yaml`.",
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape. The columns "
-                 "`ground`, and for PointPillars `cluster_id`, are used where they are there; what "
-                 "is missing is computed, and so are the clusters of people.")],
+                 "`ground`, and for PointPillars `cluster_id`, are used if present, otherwise "
+                 "computed. The clusters of people are always computed.")],
         outputs=[*BOXES_OUT,
                  ("~/debug/preprocess_ms, ground_ms, proposals_ms, evidence_ms, "
                   "fusion_ms", STRING_TIMES, "Time of each step.")]),
     "tracker": dict(
         params=params.TrackerNodeParams(),
         what="Turns the detections of any detector into tracks with ids and velocities; "
-             "scores are the evidence over time ([how](../../explanation/tracking.md)). A "
-             "lost frame is predicted over with the next one and gets no message of its own;"
-             " a late frame, and one with the stamp of the last one, get none either. A jump"
-             " in time, as of a bag that starts again, ends all tracks. /diagnostics names "
-             "what is wrong with a frame or the poses. The detector nodes do the same in "
-             "their own process with `tracking.enabled`, then from weak detections too. "
-             "Files: the argument `tracking:=true` of the launch files, "
-             "`config/tracker.param.yaml`.",
+             "scores accumulate evidence over time ([how](../../explanation/tracking.md)). "
+             "Every frame of detections results in one message, except late and repeated "
+             "frames. Tracks are predicted across lost frames. A jump in time, such as the "
+             "restart of a bag, ends all tracks. /diagnostics reports problems with a frame or "
+             "the poses. The detector nodes do the same in their own process with "
+             "`tracking.enabled`, and then also use weak detections. Files: the argument "
+             "`tracking:=true` of the launch files, `config/tracker.param.yaml`.",
         inputs=[("~/input/detections", MARKERS, "CUBEs with `ns` as class, and a score in the text "
-                 "as JSON. A frame without any is a DELETE or DELETEALL with its header."),
-                ("~/input/detections_3d", "vision_msgs/Detection3DArray", "Or this, where "
-                 "vision_msgs is installed; one of both."),
-                ("~/input/odometry", "nav_msgs/Odometry", "How the robot moves, for `ego.source` "
-                 "auto and odometry. For kiss_icp, and auto where no poses come, ~/input/points "
+                 "as JSON. A frame without detections is a DELETE or DELETEALL with its header."),
+                ("~/input/detections_3d", "vision_msgs/Detection3DArray", "Alternative to "
+                 "~/input/detections, if vision_msgs is installed."),
+                ("~/input/odometry", "nav_msgs/Odometry", "Motion of the robot, for `ego.source` "
+                 "auto and odometry. For kiss_icp, and for auto without poses, ~/input/points "
                  "(PointCloud2) has the scans.")],
         outputs=TRACKS_OUT),
     "evaluator": dict(
@@ -212,28 +208,26 @@ PAGES: dict[str, dict[str, Any]] = {
         outputs=[]),
     "bag_player": dict(
         params=params.PlayerParams(),
-        what="Replays a rosbag2 bag (MCAP or SQLite3), or one of ROS 1. Messages go from the"
-             " file to DDS as they are. Ends with exit code 0 when the bag is played.",
+        what="Replays a rosbag2 bag (MCAP or SQLite3) or a ROS 1 bag. Messages are sent over DDS "
+             "unchanged. Exits with code 0 at the end of the bag.",
         inputs=[],
         outputs=[("the topics of the bag", "as recorded", "With the recorded QoS. Livox "
                   "CustomMsg and CompressedPointCloud2 as PointCloud2."),
                  ("/clock", "rosgraph_msgs/Clock", "The bag's time, with `clock_hz`.")],
         services=[("~/pause, ~/resume", "std_srvs/Trigger", ""),
-                  ("~/step", "std_srvs/Trigger", "While paused: one more cloud and what comes "
-                   "before it."),
-                  ("~/set_rate", "rosbag2_interfaces/SetRate", "Where rosbag2_interfaces is "
-                   "installed; the parameter `rate` does the same everywhere.")]),
+                  ("~/step", "std_srvs/Trigger", "While paused: play up to the next cloud."),
+                  ("~/set_rate", "rosbag2_interfaces/SetRate", "If rosbag2_interfaces is "
+                   "installed; the parameter `rate` always works.")]),
     "bag_recorder": dict(
         params=params.RecorderParams(),
-        what="Records topics to an MCAP bag. The bag appears under its name when the node "
-             "ends.",
+        what="Records topics to an MCAP bag. The bag gets its final name when the node exits.",
         inputs=[("the topics named in topics", "any", "With the QoS of their publishers.")],
         outputs=[]),
 }
 
 
 def outputs(name: str) -> list[tuple[str, str, str]]:
-    """Rows of all that a node publishes."""
+    """Return the rows of all topics that a node publishes."""
     return PAGES[name]["outputs"] + ALWAYS_OUT + (MANAGED_OUT if _managed(name) else [])
 
 
@@ -256,8 +250,8 @@ def page(name: str) -> str:
                       *(f"| `{a}` | {b} | {c} |" for a, b, c in rows), ""]
     if "tracking.enabled" in find_node_parameters(name):
         lines += ["With `tracking.enabled` the node has the topics of the [tracker](tracker.md), "
-                  "too; a detector with a network then tracks weak detections as well, from "
-                  "`tracking.min_score` on.", ""]
+                  "too; a detector with a network then also tracks weak detections, with scores "
+                  "of at least `tracking.min_score`.", ""]
     known = find_node_parameters(name)
     first = [key for key in FIRST if key in known][:10] or [*known][:10]
     rest = [key for key in known if key not in first]
@@ -279,13 +273,13 @@ def _parameter_table(known: dict[str, Any], names: list[str]) -> list[str]:
 
 
 def best() -> str:
-    """The parameter file of the configuration `best`, for nodes."""
+    """Return the parameter file of the configuration `best`, for nodes."""
     return _parameter_file("The configuration `best` (lidar_perception/candidates/"
                            "configurations.py), for nodes", BEST_VALUES)
 
 
 def config_file(network: str) -> Path:
-    """The parameter file of a detector's graph."""
+    """Return the path of the parameter file of a detector's graph."""
     return CONFIG / f"{network}.param.yaml"
 
 

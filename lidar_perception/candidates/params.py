@@ -15,8 +15,8 @@ from lidar_perception.wire.params import InputParams, ViewParams
 class HeightParams(Params):
     """Height filter (paper A, Section 3.5)."""
 
-    tolerance: float = param(0.2, "A candidate's height may differ this much from the seed's.",
-                             unit="m", low=0.0, high=100.0)
+    tolerance: float = param(0.2, "Maximum difference between the height of a candidate and that "
+                             "of the seed.", unit="m", low=0.0, high=100.0)
 
 
 @dataclass(frozen=True)
@@ -37,46 +37,44 @@ SILHOUETTE_AXES = ("yaw", "pca")
 class StmParams(Params):
     """Single template matching (paper A, Section 3.6)."""
 
-    threshold: float = param(0.40, "Cosine similarity with the seed's silhouette from which a "
-                             "cluster is accepted.", low=0.0, high=1.0)
-    window: str = param("stretched", "stretched: the cluster's extent fills the silhouette's "
-                        "window. metric: the window is 1.6 m wide and reaches 2.4 m up from the "
-                        "ground.", choices=SILHOUETTE_WINDOWS)
-    axis: str = param("yaw", "yaw: the cluster is turned about z only. pca: its longest axis "
-                      "becomes the vertical, too.", choices=SILHOUETTE_AXES)
-    spread: bool = param(False, "Draw every point as large as the part of the surface that it "
-                         "stands for (see resolution), so that a silhouette does not depend on "
-                         "the range.")
-    dilations: int = param(1, "How many times the silhouette is dilated with 3 x 3.",
-                           low=0, high=10)
-    seen_only: bool = param(False, "With the metric window: compare only what is above the lowest "
-                            "point of both the cluster and the seed, as the rest of one of them is "
-                            "hidden.")
-    shifts: int = param(0, "Columns by which the silhouette may be moved sideways to fit the "
-                        "seed's.", low=0, high=16)
+    threshold: float = param(0.40, "Minimum cosine similarity between the silhouettes of a "
+                             "cluster and the seed.", low=0.0, high=1.0)
+    window: str = param("stretched", "stretched: the silhouette of a cluster fills the window. "
+                        "metric: the window is 1.6 m wide and 2.4 m high, starting at the ground.",
+                        choices=SILHOUETTE_WINDOWS)
+    axis: str = param("yaw", "yaw: rotate clusters about z only. pca: also rotate the longest "
+                      "axis to the vertical.", choices=SILHOUETTE_AXES)
+    spread: bool = param(False, "Draw every point as large as the surface that it represents "
+                         "(see resolution), so that a silhouette does not depend on the range.")
+    dilations: int = param(1, "Number of 3 x 3 dilations of the silhouette.", low=0, high=10)
+    seen_only: bool = param(False, "With the metric window: compare only the part above the "
+                            "lowest points of both the cluster and the seed, because the part "
+                            "below is hidden in one of them.")
+    shifts: int = param(0, "Maximum horizontal shift of the silhouette, in columns, to fit that "
+                        "of the seed.", low=0, high=16)
 
 
 @dataclass(frozen=True)
 class CpaParams(Params):
     """Centralized point augmentation (paper A, Section 3.7)."""
 
-    min_range: float = param(15.0, "Nearest horizontal range where points are added.", unit="m",
-                             low=0.0, high=1e6)
-    max_range: float = param(30.0, "Farthest horizontal range where points are added.", unit="m",
-                             low=0.0, high=1e6)
+    min_range: float = param(15.0, "Minimum horizontal range of clusters that get additional "
+                             "points.", unit="m", low=0.0, high=1e6)
+    max_range: float = param(30.0, "Maximum horizontal range of clusters that get additional "
+                             "points.", unit="m", low=0.0, high=1e6)
     steps: int = param(2, "Number of shrunken copies of the cluster that are added; 0: none.",
                        low=0, high=100)
-    decrement: float = param(0.10, "Scale lost with each copy.", low=0.0, high=1.0)
-    min_scale: float = param(0.20, "Smallest scale of a copy.", low=0.0, high=1.0)
+    decrement: float = param(0.10, "Decrease of the scale from copy to copy.", low=0.0, high=1.0)
+    min_scale: float = param(0.20, "Minimum scale of a copy.", low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)
 class ConfidenceParams(Params):
     """Probability of each candidate, from its shape and its similarity to the seed."""
 
-    enabled: bool = param(False, "Accept by confidence instead of by similarity alone, and give "
-                          "it as the score. It was fitted to what the configuration best finds.")
-    threshold: float = param(0.5, "Least confidence of a candidate.", low=0.0, high=1.0)
+    enabled: bool = param(False, "Accept candidates by confidence instead of similarity, and use "
+                          "it as the score. The confidence is fitted to the configuration best.")
+    threshold: float = param(0.5, "Minimum confidence of a candidate.", low=0.0, high=1.0)
 
 
 SEED_SOURCES = ("ground_truth", "click", "file", "automatic")
@@ -86,19 +84,18 @@ SEED_SOURCES = ("ground_truth", "click", "file", "automatic")
 class SeedParams(Params):
     """Source of the seed pedestrian (paper A, Section 3.5)."""
 
-    source: str = param(
-        "file", "ground_truth: nearest Pedestrian of the frame's labels (the paper's protocol). "
-        "click: the cluster at /clicked_point. file: a saved template. automatic: the cluster of "
-        "the frame that is most like a pedestrian, or the template where none is.",
-        choices=SEED_SOURCES)
-    file: str = param("", "Template file for source 'file', or several with commas between them; "
-                      "empty: the one that comes with the package.")
+    source: str = param("file", "ground_truth: the nearest labelled Pedestrian of the frame (the "
+                        "paper's protocol). click: the cluster at /clicked_point. file: a saved "
+                        "template. automatic: the cluster of the frame that resembles a "
+                        "pedestrian most, by default the template.", choices=SEED_SOURCES)
+    file: str = param("", "Template file for source 'file', or several separated by commas; empty: "
+                      "the shipped one.")
     bank: int = param(1, "Number of the last clicks whose seeds are kept for source 'click'. A "
                       "cluster is compared with all seeds; the most similar one counts.", low=1,
                       high=16)
-    min_confidence: float = param(0.3, "For source 'automatic': a cluster less like a pedestrian "
-                                    "than this is no seed.", low=0.0, high=1.0)
-    click_radius: float = param(2.0, "A click takes the nearest cluster within this distance.",
+    min_confidence: float = param(0.3, "For source 'automatic': minimum confidence of the seed.",
+                                  low=0.0, high=1.0)
+    click_radius: float = param(2.0, "A click selects the nearest cluster within this distance.",
                                 unit="m", low=0.01, high=100.0)
 
 

@@ -58,9 +58,9 @@ from lidar_perception.wire.track_markers import read_trails
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import to_ns
 
-RECORD = "demo.json"                      # in a folder that demo has made, what it replayed
-BEHIND_M = 2.0                            # metres; found there, and the picture is all around
-REPLACED = ("drive", "result", "logs")    # by the next demo
+RECORD = "demo.json"                      # in the output folder: what was replayed
+BEHIND_M = 2.0                            # detections this far behind need a picture of all sides
+REPLACED = ("drive", "result", "logs")    # folders that the next demo replaces
 
 
 def _runs(detector: str) -> Runs:

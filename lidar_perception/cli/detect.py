@@ -53,11 +53,11 @@ class Formats(click.ParamType):
               metavar="FORMAT[,FORMAT...]", help=f"What to write: {', '.join(FORMATS)}. May be "
               "repeated.  [default: json]")
 @detector_options(tracking=True)
-@click.option("--min-score", type=click.FloatRange(0, 1), metavar="SCORE", help="Least score of a "
-              "box of any class. Default: the thresholds of the detector.")
+@click.option("--min-score", type=click.FloatRange(0, 1), metavar="SCORE", help="Minimum score "
+              "of a box of any class. Default: the thresholds of the detector.")
 @click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
-              help="Height of the sensor above the ground. Default: what the recording says, or "
-              "else what its first clouds show.")
+              help="Height of the sensor above the ground. Default: that of the recording, or "
+              "measured on its first clouds.")
 @click.option("--track", is_flag=True, help="Write tracks, with ids and velocities, instead of the "
               "boxes of each frame alone.")
 @click.option("--ego", type=Choice(RECORDED_EGO), default="auto", show_default=True,
@@ -68,31 +68,31 @@ class Formats(click.ParamType):
 @click.option("--png", is_flag=True, help="Draw a picture of every frame, png/FRAME.png.")
 @out_file("--video", "Draw a film: .mp4 (the extra [video]), .gif or .webp.")
 @click.option("--color", type=Choice(["height", "intensity"]), default="height", show_default=True,
-              help="Of the points in pictures.")
+              help="Colour of the points in pictures.")
 @split_option
 @limit_option
 @jobs_option
 @dask_option
-@click.option("--force", is_flag=True, help="Start over where FOLDER holds another run.")
+@click.option("--force", is_flag=True, help="Start over if FOLDER has another run.")
 def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector: DetectorChoice,
            tracking: TrackingParams, min_score: float | None, mount_height: float, track: bool,
            ego: str, clouds: bool, png: bool, video: Path | None, color: str, split: Path | None,
            limit: int | None, jobs: int, dask: str | None, force: bool) -> None:
-    """Run a detector on every frame of the recording at DATA, labels or not, and write its boxes,
-    classes and scores, with --track also ids and velocities, into FOLDER.
+    """Run a detector on every frame of the recording at DATA and write boxes, classes and scores,
+    with --track also ids and velocities, into FOLDER. DATA needs no labels.
 
     \b
-    kitti      kitti/FRAME.txt, as KITTI's object benchmark has results;
-               with --track kitti/SEQUENCE.txt, as its tracking benchmark has them
+    kitti      kitti/FRAME.txt, result files of KITTI's object benchmark;
+               with --track kitti/SEQUENCE.txt, of its tracking benchmark
     json, csv  detections.json, detections.csv: boxes in the LiDAR frame
     mcap       bag/, a rosbag2 bag with the topics of the nodes, for RViz, Foxglove and view
     openlabel  openlabel/SEQUENCE.json, ASAM OpenLABEL, for label and convert
 
-    --png draws every frame, png/FRAME.png, and --video a film, without a browser.
+    --png draws every frame, png/FRAME.png, and --video a video, without a browser.
 
-    Finished frames are kept at once: the same command resumes a run that was stopped, and makes
-    more formats of one that is complete. Frames that cannot be read are named and counted; the exit
-    code is then 1.
+    Finished frames are saved at once: the same command resumes a run that was stopped, and adds
+    formats to a complete one. Frames that cannot be read are named and counted; the exit code is
+    then 1.
 
     \b
     Examples:
@@ -104,9 +104,9 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
     from lidar_perception.detecting.bag import Bag
     from lidar_perception.detecting.formats import FORMATS as WRITERS
     from lidar_perception.detecting.formats import Run
-    from lidar_perception.detecting.pictures import FilmOfFrames, FrameDrawer, Pictures
+    from lidar_perception.detecting.pictures import FrameDrawer, PictureWriter, VideoWriter
     from lidar_perception.detecting.run import detect as run_detector
-    from lidar_perception.detecting.run import header_of
+    from lidar_perception.detecting.run import make_header
     from lidar_perception.detectors.open import check_weights
     from lidar_perception.rendering.files import check_film
     from lidar_perception.tracking.drive_tracker import choose_ego_source
@@ -130,7 +130,7 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
         errors.print(doubt)
     open_ = partial(detector.open, sensor_height=height, min_score=min_score)
     opened_detector = open_()
-    header = header_of(recording, detector.weights, opened_detector,
+    header = make_header(recording, detector.weights, opened_detector,
                        tracking=tracking if track else None,
                        ego=choose_ego_source(recording, ego) if track else None,
                        split=None if split is None else str(split), device=detector.device)
@@ -141,8 +141,8 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
     drawer = FrameDrawer(run, color)
     makes: list[Any] = [partial(Bag, clouds=clouds, tracked=track) if name == "mcap" else
                         WRITERS[name] for name in chosen]
-    makes += [partial(Pictures, drawer=drawer)] if png else []
-    makes += [partial(FilmOfFrames, drawer=drawer, path=video)] if video else []
+    makes += [partial(PictureWriter, drawer=drawer)] if png else []
+    makes += [partial(VideoWriter, drawer=drawer, path=video)] if video else []
     summary = run_detector(
         run, open_ if jobs > 1 or dask else lambda: opened_detector, makes,
         tracking=tracking if track else None, ego=header["ego"] or "none", jobs=jobs, dask=dask,

@@ -237,9 +237,8 @@ TRACKER = Runs("the tracker", collect_fields(Tracked()), ("tracker",))
 
 range_option = click.option("--range", type=Choice(RANGE_CHOICES), default="auto",
                             show_default=True, help="Range of the detector: 69 m ahead, or 51 m "
-                            "to every side, which takes more than twice as long. auto: the range "
-                            "that its weights were trained for, which is ahead for those that come "
-                            "with the package.")
+                            "in all directions, which takes more than twice as long. auto: the "
+                            "range that its weights were trained for, ahead for the shipped ones.")
 device_option = click.option("--device", default="auto", show_default=True,
                              help="Where networks run: auto, cpu, cuda or cuda:N.")
 
@@ -328,8 +327,8 @@ def weights_option(default: str | None = None, multiple: bool = False) -> Callab
     more = " May be repeated." if multiple else f" Default: {default}." if default else ""
     return click.option(
         "--weights", type=click.Path(path_type=Path), metavar="FILE|NAME", multiple=multiple,
-        help="The detector: a checkpoint, a file of `train fused`, one of fused, pointpillars and "
-        "pointnet with the weights that come with the package, or a class of your own, "
+        help="The detector: a checkpoint, the output of `train fused`, one of fused, pointpillars "
+        "and pointnet with its shipped weights, or a class of your own, "
         f"module:Class.{more}")
 
 

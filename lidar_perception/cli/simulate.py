@@ -35,7 +35,7 @@ from lidar_perception.types import InputError
               help=f"One of {', '.join(SENSOR_NAMES)}, in any spelling (hdl64e is hdl-64e), a "
               f".yaml file (`setup` writes one), or {GENERIC_FORMAT}.")
 @click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
-              help="Height of the sensor above the ground. Default: what its file or preset says.")
+              help="Height of the sensor above the ground. Default: that of its file or preset.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
               help="Number of scans.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True,

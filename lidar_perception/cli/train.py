@@ -32,21 +32,21 @@ OPTIONS = (
     data_argument("Training data: a data set or bag, or `sim` for simulated scenes; may be "
                   "repeated to mix them.", several=True, kind=str),
     click.option("--val", multiple=True, metavar="PATH|sim",
-                 help="What to validate on. Default: frames held out of --data, and other "
-                 "simulated streets."),
-    a_path("--split", "Train on the frames of --data, or whole sequences, that are named in this "
-           "file, one a line."),
-    a_path("--val-split", "Validate on the frames or sequences named in this file."),
+                 help="Validation data. Default: frames held out of --data, and other simulated "
+                 "streets."),
+    a_path("--split", "Train on the frames of --data, or whole sequences, listed in this file, one "
+           "per line."),
+    a_path("--val-split", "Validate on the frames or sequences listed in this file."),
     out_folder("Folder for best.safetensors, last.safetensors, logs and the state.", required=True),
     click.option("--resume", is_flag=True, help="Resume the run in --out, if there is one."),
-    a_path("--init", "Start from the weights of this checkpoint, as far as they fit; `package`: "
-           "those that come with the package.", "FILE|package"),
+    a_path("--init", "Start from the matching weights of this checkpoint; `package`: "
+           "the shipped weights.", "FILE|package"),
     device_option,
     jobs_for_all_cores("Processes that prepare scenes; 0: only this one."),
-    click.option("--budget", type=float, metavar="HOURS", help="How long all of it may take on "
-                 "this machine: scans, steps and validations are chosen so, where they are not "
-                 "given. At the end of it the run stops, and can be resumed. Default: 2, and no "
-                 "end where --steps or --epochs are given."),
+    click.option("--budget", type=float, metavar="HOURS", help="Time budget on this machine. It "
+                 "determines scans, steps and validations that are not given. When it is used up, "
+                 "the run stops and can be resumed. Default: 2, or no limit with --steps or "
+                 "--epochs."),
 )
 
 
@@ -104,9 +104,9 @@ def train() -> None:
 def pointpillars(request: TrainingRequest, params: PointPillarsTraining) -> None:
     """Train PointPillars or EG-PointPillars on labelled frames, simulated streets, or both.
 
-    Scans, steps and validations are chosen so that all ends within --budget hours on this machine.
-    OUT/best.safetensors holds the weights with the best validation AP so far. Ctrl-C saves and
-    stops; --resume resumes, also after a kill at any time. Several GPUs: torchrun.
+    Scans, steps and validations are chosen for a duration of --budget hours on this machine.
+    OUT/best.safetensors has the weights with the best validation AP so far. Ctrl-C saves and stops;
+    --resume resumes, even after the process was killed. Use torchrun for several GPUs.
 
     \b
     Examples:
@@ -121,7 +121,7 @@ def pointpillars(request: TrainingRequest, params: PointPillarsTraining) -> None
     from lidar_perception.detectors.pointpillars.config import RANGES, make_config
     from lidar_perception.training.pointpillars.trainer import PointPillarsTrainer
     seen: dict[str, Any] = {**RANGES["around"]} if params.range == "around" else {}
-    config = make_config(params.version, params.size, **seen)  # a size by itself sees ahead
+    config = make_config(params.version, params.size, **seen)  # default: ahead
     run(PointPillarsTrainer(config), request, params)
 
 
@@ -129,11 +129,11 @@ def pointpillars(request: TrainingRequest, params: PointPillarsTraining) -> None
 @shared_options
 @training_options(PointNetTraining())
 def pointnet(request: TrainingRequest, params: PointNetTraining) -> None:
-    """Train the cluster network (PointNet) on labelled frames, simulated streets, or both.
+    """Train PointNet on labelled frames, simulated streets, or both.
 
-    Scenes are cut into clusters by the package's own ground and clustering. Scans and steps are
-    chosen so that all ends within --budget hours on this machine. The best weights so far lie in
-    OUT/best.safetensors, their scores calibrated on what is validated on.
+    Scenes are split into clusters by ground segmentation and clustering. Scans and steps are chosen
+    for a duration of --budget hours on this machine. OUT/best.safetensors has the best weights so
+    far, with scores calibrated on the validation data.
 
     \b
     Examples:
@@ -145,28 +145,25 @@ def pointnet(request: TrainingRequest, params: PointNetTraining) -> None:
     """
     from lidar_perception.detectors.pointnet.config import make_pointnet_config
     from lidar_perception.training.pointnet.trainer import PointNetTrainer, find_proposer
-    find_proposer(params)  # raises InputError before anything is made
+    find_proposer(params)  # raises InputError before any work
     run(PointNetTrainer(make_pointnet_config(params.network)), request, params)
 
 
 @train.command()
-@a_path("--weights", "PointPillars' checkpoint, or an exported one (.onnx). Default: the one that "
-        "comes with the package.")
-@a_path("--classifier", "Checkpoint of the cluster network. Default: the one that comes with the "
-        "package.")
-@out_file("--out", "File to write (.json), which is then what --weights and `fused.weights` take.",
-          required=True)
+@a_path("--weights", "Checkpoint or exported network (.onnx) of PointPillars. Default: the shipped "
+        "one.")
+@a_path("--classifier", "Checkpoint of PointNet. Default: the shipped one.")
+@out_file("--out", "File to write (.json), for --weights and `fused.weights`.", required=True)
 @click.option("--force", is_flag=True, help="Replace --out.")
-@jobs_for_all_cores("Processes that look at scans.", 1)
+@jobs_for_all_cores("Processes that evaluate scans.", 1)
 @training_options(FusedTraining())
 def fused(weights: Path | None, classifier: Path | None, out: Path, force: bool, jobs: int,
           params: FusedTraining) -> None:
-    """Fit the fused detector to your own weights: how much each source counts.
+    """Fit the fused detector to your own weights.
 
-    PointPillars, silhouettes and the cluster network look at simulated scans of the sensor that
-    the weights were trained for. What they say together becomes a probability, so that the
-    threshold holds. Takes some minutes. The file names both networks and leaves them where they
-    are.
+    PointPillars, silhouettes and PointNet are evaluated on simulated scans of the sensor that the
+    weights were trained for. The fitted curves combine their scores into a calibrated probability.
+    This takes a few minutes. The file refers to the weights of both networks by their paths.
 
     \b
     Examples:

@@ -1,1 +1,1 @@
-"""Running a detector over a recording and writing its results, as files and as pictures."""
+"""Detection in a whole recording, with results as files and as pictures."""

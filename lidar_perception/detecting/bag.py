@@ -21,9 +21,12 @@ from msg_utils.markers import MarkerRow, list_marker_keys
 
 
 class Bag:
-    """A bag, bag/: detections, and with tracks those, on the topics of the nodes that find them, as
-    MarkerArray and Detection3DArray; labels, camera and odometry, where there are any; and the
-    clouds, unless they are left out. All have the stamps of their clouds."""
+    """A bag, bag/, with detections, optional tracks, available labels, camera and odometry, and
+    optionally the clouds.
+
+    Detections and tracks are MarkerArray and Detection3DArray messages on the topics of the nodes.
+    All messages have the stamp of their cloud.
+    """
 
     def __init__(self, run: Run, clouds: bool, tracked: bool) -> None:
         self.run, self.clouds = run, clouds
@@ -46,15 +49,15 @@ class Bag:
         self.bag.__exit__(*error)
 
     def add(self, result: FrameResult) -> None:
-        """Write a frame. One that no bag can hold is added to the skipped ones instead."""
+        """Write a frame, or add it to the skipped frames if a bag cannot represent it."""
         frame = result.frame
-        if not self.clouds:  # then nothing but its frame is needed of it
-            nobody = PointCloud(np.zeros((0, 3), np.float32), frame_id=result.frame_id)
-            frame = replace(frame, load=lambda: nobody)
+        if not self.clouds:  # only the frame_id of the cloud is needed
+            empty = PointCloud(np.zeros((0, 3), np.float32), frame_id=result.frame_id)
+            frame = replace(frame, load=lambda: empty)
         try:
             content = self.writer.read(frame)
         except InputError:
-            try:  # without labels that no bag can hold
+            try:  # again without labels
                 content = self.writer.read(replace(frame, truth=return_none))
             except InputError as error:
                 self.run.skipped.append(f"not in {self.path}: {error}")

@@ -1,4 +1,4 @@
-"""The formats of results: one class each, which gets the frames in order of time."""
+"""Output formats: one class per format, which receives the frames in order of time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lidar_perception.data.kitti.results import (
     write_results,
     write_tracking_results,
 )
-from lidar_perception.detecting.results import FrameResult, short_floats, with_optional_parts
+from lidar_perception.detecting.results import FrameResult, to_short_floats, with_optional_parts
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
 from lidar_perception.labels.exchange import export_labels
 from lidar_perception.runs.files import write_text
@@ -43,11 +43,15 @@ UNITS = {
 
 @dataclass
 class Run:
-    """A run of a detector, as its formats see it.
+    """A run of a detector on a recording.
 
-    recording: its data; out: its folder; header: a JSON object, see run.header_of; count: the
-    number of frames to write; skipped: a line for each of them that could not be read or written;
-    remarks: lines about the results, grouped by their text without numbers.
+    Attributes:
+        recording: input data.
+        out: output folder.
+        header: a JSON object, see run.make_header.
+        count: number of frames to write.
+        skipped: one line for each frame that could not be read or written.
+        remarks: lines about the results, grouped by their text without numbers.
     """
 
     recording: Recording
@@ -57,15 +61,20 @@ class Run:
     skipped: list[str] = field(default_factory=list)
     remarks: dict[str, dict[str, None]] = field(default_factory=dict)
 
-    def say(self, remark: str) -> None:
-        """Add a remark, once."""
+    def add_remark(self, remark: str) -> None:
+        """Add a remark unless it was added before."""
         self.remarks.setdefault(mask_numbers(remark), {})[remark] = None
 
 
 class Format(Protocol):
-    """A context manager that gets all results in order of time; path, where they are, is complete
-    after it. needs_scans: it draws or writes the points, too. InputError where results cannot be
-    written."""
+    """A context manager that receives all results in order of time.
+
+    An InputError is raised if results cannot be written.
+
+    Attributes:
+        path: file or folder of the results, complete after the context.
+        needs_scans: the format needs the points of the clouds.
+    """
 
     path: Path
     needs_scans: bool
@@ -79,8 +88,8 @@ class Format(Protocol):
         """Write the result of the next frame."""
 
 
-class WrittenAtEnd:
-    """Base of formats that write everything at the end, if no error came before."""
+class BufferedFormat:
+    """Base class of formats that write everything at the end, unless there was an error."""
 
     needs_scans = False
 
@@ -98,9 +107,9 @@ class WrittenAtEnd:
         """Write the file or files."""
 
 
-class Kitti(WrittenAtEnd):
-    """Result files of KITTI's object benchmark, kitti/FRAME.txt; with tracks those of its tracking
-    benchmark, kitti/SEQUENCE.txt, where drives without a name are 0000, 0001, and so on, and their
+class Kitti(BufferedFormat):
+    """Result files of KITTI's object benchmark, kitti/FRAME.txt, or with tracks of its tracking
+    benchmark, kitti/SEQUENCE.txt. Drives without a name are numbered 0000, 0001, ..., and their
     frames are counted from 0."""
 
     def __init__(self, run: Run) -> None:
@@ -110,12 +119,12 @@ class Kitti(WrittenAtEnd):
         self.cameras: dict[str, Calibration] = {}
 
     def add(self, result: FrameResult) -> None:
-        """Write the file of a frame, or keep its tracks for that of their drive."""
+        """Write the file of a frame, or keep its tracks for the file of the drive."""
         frame = result.frame
         calibration, nominal = choose_calibration(frame)
         if nominal:
-            self.run.say("there is no camera calibration: kitti/ is in the frame of a nominal "
-                         "camera, level and 0.27 m ahead of the LiDAR")
+            self.run.add_remark("there is no camera calibration: kitti/ is in the frame of a "
+                                "nominal camera, level and 0.27 m ahead of the LiDAR")
         if result.tracks is None:
             write_results(self.path / f"{frame.name}.txt", result.objects, calibration)
             return
@@ -127,13 +136,13 @@ class Kitti(WrittenAtEnd):
     def finish(self) -> None:
         for drive, frames in self.drives.items():
             name = self.names[drive]
-            first = 0 if name == drive else frames[0][0]  # a drive without a name begins at 0
+            first = 0 if name == drive else frames[0][0]  # unnamed drives start at 0
             write_tracking_results(self.path / f"{name}.txt",
                                    [(number - first, ids, found) for number, ids, found in frames],
                                    self.cameras[drive])
 
 
-class Json(WrittenAtEnd):
+class Json(BufferedFormat):
     """One JSON document, detections.json: a header, then one frame on each line."""
 
     def __init__(self, run: Run) -> None:
@@ -146,7 +155,7 @@ class Json(WrittenAtEnd):
         self.lines.append(json.dumps({
             "name": frame.name, "sequence": frame.sequence, "index": frame.index,
             "stamp_ns": frame.stamp_ns, "frame_id": result.frame_id, "ms": result.ms,
-            "problem": result.problem, "objects": rows(result)}, allow_nan=False))
+            "problem": result.problem, "objects": make_rows(result)}, allow_nan=False))
 
     def finish(self) -> None:
         head = json.dumps({"format": "lidar_perception detections", "units": UNITS,
@@ -154,8 +163,8 @@ class Json(WrittenAtEnd):
         write_text(self.path, f'{head[:-2]},\n "frames": [\n' + ",\n".join(self.lines) + "\n]}")
 
 
-class Csv(WrittenAtEnd):
-    """One table, detections.csv, of a row for each object; see COLUMNS."""
+class Csv(BufferedFormat):
+    """One table, detections.csv, with a row for each object; see COLUMNS."""
 
     def __init__(self, run: Run) -> None:
         super().__init__(run, run.out / "detections.csv")
@@ -164,9 +173,9 @@ class Csv(WrittenAtEnd):
         self.table.writerow(COLUMNS)
 
     def add(self, result: FrameResult) -> None:
-        """Keep the rows of a frame."""
+        """Keep the make_rows of a frame."""
         frame = result.frame
-        for row in rows(result):
+        for row in make_rows(result):
             self.table.writerow([
                 frame.name, frame.sequence, frame.index, frame.stamp_ns, result.frame_id,
                 row["id"], row["class"], row["score"], *(row[name] for name in BOX),
@@ -176,9 +185,9 @@ class Csv(WrittenAtEnd):
         write_text(self.path, self.text.getvalue())
 
 
-class OpenLabel(WrittenAtEnd):
-    """ASAM OpenLABEL, openlabel/SEQUENCE.json, as `convert` and `label` read it; 0000.json where
-    there are no sequences. The velocity of a track is an attribute of its cuboid."""
+class OpenLabel(BufferedFormat):
+    """ASAM OpenLABEL, openlabel/SEQUENCE.json, for `convert` and `label`; 0000.json without
+    sequences. The velocity of a track is an attribute of its cuboid."""
 
     def __init__(self, run: Run) -> None:
         super().__init__(run, run.out / "openlabel")
@@ -186,7 +195,7 @@ class OpenLabel(WrittenAtEnd):
 
     def add(self, result: FrameResult) -> None:
         """Keep the labels of a frame."""
-        frame, found = result.frame, rows(result)
+        frame, found = result.frame, make_rows(result)
         self.labels[frame.name] = FrameLabels.of(
             frame.name, frame.stamp_ns, result.objects.boxes, [row["class"] for row in found],
             [-1 if row["id"] is None else row["id"] for row in found],
@@ -194,7 +203,7 @@ class OpenLabel(WrittenAtEnd):
             [{"velocity": row["velocity"]} if row["velocity"] else {} for row in found])
 
     def finish(self) -> None:
-        frames = [with_optional_parts(self.run.recording.frames[i], self.run.say)
+        frames = [with_optional_parts(self.run.recording.frames[i], self.run.add_remark)
                   for i in range(self.run.count)]
         labels = [self.labels.get(frame.name) or FrameLabels.of(frame.name, frame.stamp_ns)
                   for frame in frames]
@@ -205,18 +214,18 @@ FORMATS: Mapping[str, type] = {"kitti": Kitti, "json": Json, "csv": Csv, "openla
 
 
 def mask_numbers(line: str) -> str:
-    """Return a line with # for its numbers, so that it is the same for many frames."""
+    """Replace the numbers in a line by #, to group lines of different frames."""
     return re.sub(r"\d[\d.]*", "#", line)
 
 
-def rows(result: FrameResult) -> list[dict[str, Any]]:
-    """The objects of a frame as JSON objects: id and velocity, None without tracks, class, score,
-    and the box by the names of BOX."""
+def make_rows(result: FrameResult) -> list[dict[str, Any]]:
+    """Return the objects of a frame as JSON objects with id, velocity (both None without tracks),
+    class, score, and the numbers of the box named as in BOX."""
     found, tracks = result.objects, result.tracks
     ids = repeat(None) if tracks is None else tracks.ids.tolist()
-    velocities = repeat(None) if tracks is None else short_floats(tracks.velocities)
+    velocities = repeat(None) if tracks is None else to_short_floats(tracks.velocities)
     return [{"id": number, "class": CLASSES[c], "score": score, **dict(zip(BOX, box)),
              "velocity": velocity}
             for number, velocity, c, score, box in zip(
-                ids, velocities, found.class_ids, short_floats(found.scores),
-                short_floats(found.boxes))]
+                ids, velocities, found.class_ids, to_short_floats(found.scores),
+                to_short_floats(found.boxes))]

@@ -1,4 +1,4 @@
-"""A run: a detector over all frames of a recording, then the formats, in order of time."""
+"""A run: the detector on all frames of a recording, then the output formats in order of time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import numpy as np
 from lidar_perception import __version__
 from lidar_perception.data.frame import Recording
 from lidar_perception.detecting.formats import Format, Run, mask_numbers
-from lidar_perception.detecting.results import FrameResult, by_detector, by_record
+from lidar_perception.detecting.results import FrameResult, start_detection, start_writing
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import ConfigurableDetector, resolve_weights
 from lidar_perception.param_fields import flatten
@@ -28,18 +28,22 @@ from lidar_perception.tracking.drive_tracker import DriveTracker
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import CLASSES
 
-# What a run writes into its folder, besides the journal and a bag, which replaces itself.
-WRITTEN = ("kitti/**/*.txt", "detections.json", "detections.csv", "openlabel/*.json",
+# Output files of a run, without the journal and the bag, which is replaced as a whole.
+OUTPUT_PATTERNS = ("kitti/**/*.txt", "detections.json", "detections.csv", "openlabel/*.json",
            "png/**/*.png")
 
 
 @dataclass
 class Summary:
-    """Counts over the results of a run, which it hands on to the formats.
+    """Statistics of the results of a run. It also passes the results on to the formats.
 
-    frames: number of results; boxes: number by class; tracks: ids; ms: times of the detector;
-    problems: of the detector and of the tracker, each with its number of frames; skipped: a line
-    for each frame without a result.
+    Attributes:
+        frames: number of results.
+        boxes: number of boxes by class.
+        tracks: ids of tracks.
+        ms: durations of detection.
+        problems: problems of detector and tracker with their numbers of frames.
+        skipped: one line for each frame without a result.
     """
 
     formats: Sequence[Format] = ()
@@ -49,10 +53,10 @@ class Summary:
     ms: list[float] = field(default_factory=list)
     problems: Counter[str] = field(default_factory=Counter)
     skipped: list[str] = field(default_factory=list)
-    _first: dict[str, str] = field(default_factory=dict)  # of problems that differ in numbers only
+    _first: dict[str, str] = field(default_factory=dict)  # problem by its text without numbers
 
     def update(self, result: FrameResult) -> None:
-        """Count a frame, and write it in all formats."""
+        """Count a frame and write it in all formats."""
         self.frames += 1
         self.boxes.update(CLASSES[i] for i in result.objects.class_ids)
         self.tracks.update([] if result.tracks is None else result.tracks.ids.tolist())
@@ -64,26 +68,27 @@ class Summary:
 
     @property
     def paths(self) -> list[Path]:
-        """Where the results are; nothing is written without a result."""
+        """Paths of the results that exist."""
         return [each.path for each in self.formats if each.path.exists()]
 
     def compute(self) -> dict[str, Any]:
-        """All of it, as JSON can hold it; ms is the median, None without frames."""
+        """Return the statistics as JSON; ms is the median, None without frames."""
         return {"frames": self.frames, "boxes": dict(self.boxes), "tracks": len(self.tracks),
                 "ms": float(np.median(self.ms)) if self.ms else None,
                 "problems": dict(self.problems), "skipped": self.skipped}
 
 
-def header_of(recording: Recording, weights: str, detector: ConfigurableDetector, *,
+def make_header(recording: Recording, weights: str, detector: ConfigurableDetector, *,
               tracking: TrackingParams | None = None, ego: str | None = None,
               **more: Any) -> dict[str, Any]:
-    """Return a JSON object with everything that the results of a run depend on: two runs with the
-    same header have the same results.
+    """Return a JSON object with everything that determines the results of a run.
+
+    Two runs with the same header have the same results.
 
     Args:
         weights: a file or a name.
-        detector: opened from weights, with the thresholds of the boxes that are written.
-        ego: the source of poses for the tracks.
+        detector: opened from `weights`, with the thresholds of the written boxes.
+        ego: source of poses for the tracks.
         more: other settings.
     """
     kind, file = resolve_weights(weights)
@@ -100,20 +105,26 @@ def header_of(recording: Recording, weights: str, detector: ConfigurableDetector
 def detect(run: Run, open_: Callable[[], Detector], formats: Sequence[Callable[[Run], Format]], *,
            tracking: TrackingParams | None = None, ego: str = "auto", jobs: int = 1,
            dask: str | None = None, force: bool = False) -> Summary:
-    """Run the detector of open_() on the first run.count frames of a recording, and write what
-    reaches the min_scores of run.header, or with tracking the tracks of all that it finds.
+    """Run a detector on the first run.count frames of a recording and write the results.
 
-    Every finished frame is kept in run.out at once, so a run of the same header that was stopped is
-    resumed, and one with other formats does not detect again. The results do not depend on that,
-    nor on jobs or dask (see scoring.run.results), apart from times. InputError if run.out holds
-    something else, unless force, which starts over; if results cannot be written, or a process or
-    a cluster fails.
+    Detections are written if they reach the min_scores of run.header. With tracking, the tracks of
+    all detections are written instead. Finished frames are saved in run.out at once. A stopped run
+    with the same header is resumed, and other formats are added without detecting again. Except for
+    durations, results do not depend on resuming, jobs or dask (see scoring.run.results).
+
+    Args:
+        open_: opens the detector.
+        force: start over if run.out has other results.
+
+    Raises:
+        InputError: run.out has other results, results cannot be written, or a process or the
+            cluster fails.
     """
     recording = run.recording
     tracker = None if tracking is None else partial(DriveTracker, params=tracking, ego=ego)
-    with open_journal(run.out, run.header, force=force, list_files=written) as done:
+    with open_journal(run.out, run.header, force=force, list_files=list_outputs) as done:
         names = [frame.name for frame in islice(recording, run.count)]
-        fill_journal(done, recording, by_detector(open_), names, jobs=jobs, dask=dask,
+        fill_journal(done, recording, start_detection(open_), names, jobs=jobs, dask=dask,
                      title="detecting")
         done.sort(names)
 
@@ -122,13 +133,13 @@ def detect(run: Run, open_: Callable[[], Detector], formats: Sequence[Callable[[
 
         with ExitStack() as stack:
             made = [stack.enter_context(make(run)) for make in formats]
-            start = by_record(record_of, run.header["min_scores"], tracker, run.say,
-                              scans=any(each.needs_scans for each in made))
+            start = start_writing(record_of, run.header["min_scores"], tracker, run.add_remark,
+                                  scans=any(each.needs_scans for each in made))
             summary = Summary(made, skipped=run.skipped)
             fill(summary, recording, start, limit=run.count, title="writing")
     return summary
 
 
-def written(folder: Path) -> list[Path]:
-    """List the files that runs have written into a folder, besides the journal."""
-    return [path for pattern in WRITTEN for path in folder.glob(pattern)]
+def list_outputs(folder: Path) -> list[Path]:
+    """List the output files of runs in a folder, without the journal."""
+    return [path for pattern in OUTPUT_PATTERNS for path in folder.glob(pattern)]

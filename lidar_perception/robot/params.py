@@ -12,18 +12,19 @@ from lidar_perception.param_fields import Params, param
 class CropParams(Params):
     """Crop before all other processing; by default it removes nothing."""
 
-    body: tuple[float, ...] = param(
-        float, "The robot's own body: points in the box [min x, min y, min z, max x, max y, max z] "
-        "are left out. In the sensor's frame, or in `base_frame` where a node has that. Empty: "
-        "none.", unit="m")
-    min_range: float = param(0.0, "Points nearer to the sensor than this are left out.", unit="m",
-                             low=0.0, high=1e5)
-    max_range: float = param(0.0, "Points farther from the sensor than this are left out; 0: no "
-                                  "limit.", unit="m", low=0.0, high=1e5)
-    sectors: tuple[float, ...] = param(
-        float, "Azimuths that are left out, as seen from the sensor: from, to, from, to ...; 0 is "
-        "straight ahead, where `input.ahead` says, 90 to the left, however the sensor is mounted. "
-        "150, 210 is what is behind.", unit="deg")
+    body: tuple[float, ...] = param(float, "Box of the robot's own body, [min x, min y, min z, "
+                                    "max x, max y, max z], in which points are dropped. In the "
+                                    "sensor's frame, or in `base_frame` if it is set. Empty: "
+                                    "none.", unit="m")
+    min_range: float = param(0.0, "Points closer to the sensor are dropped.", unit="m", low=0.0,
+                             high=1e5)
+    max_range: float = param(0.0, "Points farther from the sensor are dropped; 0: no limit.",
+                             unit="m", low=0.0, high=1e5)
+    sectors: tuple[float, ...] = param(float, "Azimuth ranges to drop, seen from the sensor: "
+                                       "from, to, from, to ...; 0 is straight ahead (see "
+                                       "`input.ahead`), 90 is left, however the sensor is "
+                                       "mounted. 150, 210 is the area behind the sensor.",
+                                       unit="deg")
 
     @property
     def enabled(self) -> bool:

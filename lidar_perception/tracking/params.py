@@ -46,13 +46,8 @@ class AssociationParams(Params):
                           "reach.", low=0.1, high=20.0)
     max_gate: float = param(5.0, "Largest gate 0.1 s after the previous frame; it grows in "
                             "proportion to the time.", unit="m", low=0.1, high=100.0)
-    strong: float = param(
-        0.2,
-        "Detections with at least this score are matched first and can "
-        "start tracks. Weaker ones only continue unmatched tracks.",
-        low=0.0,
-        high=1.0,
-    )
+    strong: float = param(0.2, "Minimum score of detections that are matched first and can start "
+                          "tracks. Weaker ones only continue unmatched tracks.", low=0.0, high=1.0)
     other_kind: float = param(0.8, "Added to the cost (limit 1) of matching a vehicle with a "
                               "person; half of it for a pedestrian with a cyclist.", low=0.0,
                               high=10.0)
@@ -71,19 +66,17 @@ class ExistenceParams(Params):
                           high=1000.0)
     prior: float = param(0.0, "Log odds of a track before any evidence.", low=-10.0, high=10.0)
     missed: float = param(-1.5, "Evidence of a missed frame.", low=-10.0, high=0.0)
-    moves: float = param(
-        1.0, "Evidence of motion, used only with poses: posts do not walk.", low=0.0, high=10.0
-    )
+    moves: float = param(1.0, "Evidence of motion, used only with poses.", low=0.0, high=10.0)
     walking: float = param(3.0, "Highest speed of a pedestrian.", unit="m/s",
                            low=0.5, high=100.0)
     faster: float = param(3.0, "Evidence against a pedestrian above that speed, used only with "
-                          "poses: riders look like people.", low=0.0, high=20.0)
+                          "poses, because cyclists can look like people.", low=0.0, high=20.0)
     seen: float = param(2.0, "Increase of the log odds of presence per hit.", low=0.0,
                         high=10.0)
     max_present: float = param(3.0, "Upper limit of the log odds of presence.",
                                low=0.0, high=20.0)
     max_absence: float = param(0.4, "Largest decrease of the log odds of presence in 0.1 s of "
-                               "misses: occlusions last for a while.", low=0.01, high=10.0)
+                               "misses, because occlusions last for a while.", low=0.01, high=10.0)
     end: float = param(0.02, "A track ends when its probability of presence is lower.", low=0.0,
                        high=0.5)
 
@@ -103,20 +96,19 @@ class TrackingParams(Params):
                                  "detection in this frame is published.", low=0.0, high=1.0)
     overlap: float = param(0.3, "Of two tracks with a BEV IoU above this, the less probable one "
                            "ends.", low=0.0, high=1.0)
-    moving_speed: float = param(0.5, "A faster track counts as moving.", unit="m/s",
-                                low=0.0, high=10.0)
+    moving_speed: float = param(0.5, "Minimum speed of a moving track.", unit="m/s", low=0.0,
+                                high=10.0)
     min_score: float = param(0.05, "Detections with a lower score are ignored.", low=0.0, high=1.0)
-    max_detections: int = param(
-        300, "Highest number of detections used per frame: the best ones.", low=1, high=10_000
-    )
-    max_tracks: int = param(300, "Highest number of tracks at a time.", low=1, high=10_000)
+    max_detections: int = param(300, "Maximum number of detections per frame; the best scores "
+                                "are kept.", low=1, high=10_000)
+    max_tracks: int = param(300, "Maximum number of tracks.", low=1, high=10_000)
     period: float = param(0.1, "Time between frames without stamps.", unit="s",
                           low=0.001, high=10.0)
     max_gap: float = param(1.0, "All tracks end when time jumps forward by more than this, or "
                            "backward.",
                            unit="s", low=0.01, high=100.0)
-    max_ego_gap: float = param(1.0, "Without poses the sensor is assumed to keep its velocity for "
-                               "this long, then to stand still.", unit="s", low=0.0,
+    max_ego_gap: float = param(1.0, "Without poses, the sensor is assumed to keep its velocity "
+                               "for this long, then to stand still.", unit="s", low=0.0,
                                high=100.0)
 
     def motion_by_kind(self) -> tuple[MotionParams, ...]:

@@ -367,7 +367,7 @@ def test_options_that_cannot_be_used_are_refused(arguments, words, kitti, tmp_pa
     assert words in capsys.readouterr().err and made == [] and not (tmp_path / "out").exists()
 
 
-# Pictures and films
+# PictureWriter and films
 
 
 def test_pictures_and_a_film_of_every_frame(drives, tmp_path, monkeypatch, made):
@@ -407,5 +407,5 @@ def test_pictures_say_when_they_are(stamp, timed, expected, tmp_path):
               for i in range(2)]
     run = made_run(Recording(tmp_path / "drive", "", frames, has_times=timed), tmp_path / "out")
     drawer = FrameDrawer(run)
-    drawer.stage_of(FrameResult(frames[0], Detections.none(), "velodyne", 1.0))
+    drawer.get_stage(FrameResult(frames[0], Detections.none(), "velodyne", 1.0))
     assert drawer.time(stamp) == expected

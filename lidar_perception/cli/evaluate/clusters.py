@@ -1,4 +1,4 @@
-"""evaluate clusters: a cluster network's classes against labels, without ROS."""
+"""evaluate clusters: classes assigned by PointNet against labels, without ROS."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ def _runs(weights: Path | None) -> Runs:
 
 @click.command(cls=Command)
 @scoring_options()
-@a_path("--weights", "Checkpoint of a cluster network. Default: the one that comes with the "
-        "package.")
+@a_path("--weights", "Checkpoint of PointNet. Default: the shipped one.")
 @settings_options(lambda given: [_runs(given.get("weights"))], "clustering.density=0")
 def clusters(options: ScoringOptions, weights: Path | None, settings: Settings) -> None:
-    """Score the classes that the cluster network (PointNet) assigns to clusters and points.
+    """Score the classes that PointNet assigns to clusters and points.
 
-    Clusters are made as for its training, unless --config or --set change that. A cluster is an
-    object if at least half of its points lie in the object's box, and background if less than 15
-    percent lie in any; the others do not count, nor do Van, Truck, Tram, Person_sitting and
-    DontCare regions. Only points in the image count, as labels end there; without a camera all do.
+    Clusters are made as in its training, unless --config or --set change this. A cluster is an
+    object if at least half of its points are in the object's box, and background if less than 15
+    percent are in any box. Other clusters are ignored, and so are Van, Truck, Tram, Person_sitting
+    and DontCare regions. Only points in the image count, because only those are labelled; without a
+    camera all points count.
 
     \b
     Example:

@@ -135,8 +135,8 @@ def _print(content: dict[str, Any]) -> None:
               help="Keep only this share of the points of each scan, 0..1, drawn at random but "
               "always the same. Default: 1.")
 @click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
-              help="Height of the sensor above the ground. Default: what the recording says, or "
-              "else what its first clouds show.")
+              help="Height of the sensor above the ground. Default: that of the recording, or "
+              "measured on its first clouds.")
 @out_folder("Write the detections of --weights as KITTI result files, also for frames without "
             "labels.", "--write-results")
 @click.option("--errors", is_flag=True, help="Also print how found boxes differ from the true "
