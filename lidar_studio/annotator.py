@@ -157,7 +157,7 @@ class Annotator:
                 return
         frame = min(boxes, key=lambda f: float(np.hypot(*boxes[f][:2])))
         try:
-            xyz = self._point(frame, boxes[frame])
+            xyz = self._find_click_point(frame, boxes[frame])
             self._do("click: seed", do="seed", frame=frame, xyz=xyz, **{"class": PERSON})
             self._own[person] = self.session.state.seeds[-1][1]
         except InputError:  # no cluster
@@ -166,7 +166,7 @@ class Annotator:
                      **{"class": PERSON})
             self.counts["adjust"] += ADJUST_ACTIONS
 
-    def _point(self, frame: int, box: Array) -> list[float]:
+    def _find_click_point(self, frame: int, box: Array) -> list[float]:
         """Return a clustered point of the person near the centre of the box."""
         scan = self.session.drive.load_scan(frame)
         inside = np.flatnonzero(points_in_box(scan.xyz, box, 0.1) & (scan.cluster_ids > 0))

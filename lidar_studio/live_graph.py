@@ -197,7 +197,7 @@ class LiveGraph:
         if frame.shown:
             # Labels may arrive at any time, and the first array of a topic was not expected.
             box_topic.late += box_topic.kind != LABELS and box_topic.received > 1
-            self._notify(self._event(frame))
+            self._notify(self._make_event(frame))
 
     def update(self) -> None:
         """Show the newest frame that has all its boxes or has waited MAX_WAIT_S, and report a
@@ -217,9 +217,9 @@ class LiveGraph:
                     for older in self._frames.values():
                         if not older.shown and older.number <= frame.number:
                             older.shown = True
-                            self._notify(self._event(older))
+                            self._notify(self._make_event(older))
                     break
-            if (status := self.status()) != self._last_status:
+            if (status := self.get_status()) != self._last_status:
                 self._last_status = status
                 self._notify({"status": status})
 
@@ -227,7 +227,7 @@ class LiveGraph:
         for listener in list(self.listeners):
             listener(event)
 
-    def status(self) -> dict[str, Any]:
+    def get_status(self) -> dict[str, Any]:
         """Return the problems as lines of text, and the statistics of the clouds and of each box
         topic."""
         with self._lock:
@@ -240,11 +240,11 @@ class LiveGraph:
                                 "ms": round(float(np.median(t.delays)), -1) if t.delays else None}
                                for topic, t in self.topics.items()]}
 
-    def _event(self, frame: LiveFrame) -> dict[str, Any]:
+    def _make_event(self, frame: LiveFrame) -> dict[str, Any]:
         return {"live": {"first": self.first, **_frame_to_json(frame),
-                         "tracks": self._tracks([frame])}}
+                         "tracks": self._tracks_to_json([frame])}}
 
-    def _tracks(self, frames: list[LiveFrame]) -> list[dict[str, Any]]:
+    def _tracks_to_json(self, frames: list[LiveFrame]) -> list[dict[str, Any]]:
         """Convert the tracks in some frames to JSON objects of the page, with trails by frame."""
         made: list[dict[str, Any]] = []
         for topic, box_topic in self.topics.items():
@@ -258,17 +258,17 @@ class LiveGraph:
                 made.append(track)
         return made
 
-    def tracks(self) -> list[dict[str, Any]]:
+    def list_tracks(self) -> list[dict[str, Any]]:
         """Return the tracks of all shown frames, as JSON objects of the page."""
         with self._lock:
-            return self._tracks([f for f in self._frames.values() if f.shown])
+            return self._tracks_to_json([f for f in self._frames.values() if f.shown])
 
-    def frames(self) -> list[dict[str, Any]]:
+    def list_frames(self) -> list[dict[str, Any]]:
         """List the shown frames, as in the answer of /api/drive."""
         with self._lock:
             return [_frame_to_json(frame) for frame in self._frames.values() if frame.shown]
 
-    def _frame(self, i: int) -> LiveFrame:
+    def _get_frame(self, i: int) -> LiveFrame:
         with self._lock:
             if (frame := self._frames.get(i)) is None:
                 raise InputError(f"frame {i} is no longer stored; the oldest is {self.first}")
@@ -277,13 +277,13 @@ class LiveGraph:
     def load_scan(self, i: int) -> Scan:
         """Return the scan of a frame, with the cloud's ground and clusters. InputError if the cloud
         is invalid or no longer stored."""
-        return scan_from_message(self._frame(i).cloud, scale=self._scale)
+        return scan_from_message(self._get_frame(i).cloud, scale=self._scale)
 
     def layers(self, i: int, min_score: float) -> dict[str, Any]:
         """Return the answer of /api/labels: labels, detections, and missed labels at a minimum
         score. False detections are unknown, as it is unknown where labels end."""
         with self._lock:
-            objects = self._frame(i).objects
+            objects = self._get_frame(i).objects
             of_kind = {kind: {t: o for t, o in objects.items() if t in self.topics
                               and self.topics[t].kind == kind} for kind in (BOXES, LABELS)}
         found = {name_source(t): detections_with_sources(o) for t, o in of_kind[BOXES].items()}

@@ -46,8 +46,8 @@ class PageContent:
                   "can_export": [*FORMATS] if self.session else []}
         if isinstance(self.drive, LiveGraph):
             return {**common, "path": "", "layout": "live", "has": [],
-                    "first": self.drive.first, "frames": self.drive.frames(),
-                    "status": self.drive.status()}
+                    "first": self.drive.first, "frames": self.drive.list_frames(),
+                    "status": self.drive.get_status()}
         poses = (self.session or self.drive).motion.poses
         frames = [{"name": f.name, "stamp_ns": f.stamp_ns, "sequence": f.sequence,
                    "pose": None if poses is None else poses[i].ravel().tolist()}

@@ -57,7 +57,7 @@ class SizeSeed:
 
 @dataclass(frozen=True)
 class ProposalRequest:
-    """Seeds whose like is proposed, and by frame the boxes that a person placed.
+    """Seeds of similar objects to propose, and by frame the boxes that a person placed.
 
     detected: the survey has detections, so clusters that only have the size of a seed count less.
     """

@@ -78,7 +78,7 @@ class Proposer:
         except InputError as error:
             self.problem = str(error)
 
-    def survey(self, on_progress: Callable[[int], bool], in_process: bool = False) -> bool:
+    def run_survey(self, on_progress: Callable[[int], bool], in_process: bool = False) -> bool:
         """Survey the remaining frames and cache the result.
 
         Args:
@@ -113,7 +113,7 @@ class Proposer:
         except InputError as error:
             self.problem = str(error)
 
-    def poses(self) -> list[list[float]] | None:
+    def collect_scan_poses(self) -> list[list[float]] | None:
         """Return the sensor's pose in each frame from scan matching, 16 numbers each; None if the
         drive has poses or scan matching gave none."""
         if self.drive.motion.poses is not None or not self.surveys:
@@ -122,11 +122,13 @@ class Proposer:
         return [np.round(pose, 6).ravel().tolist() for pose in found] if len(found) == len(
             self.surveys) else None
 
-    def proposals(self, state: State, motion: Motion, frames: range | None = None,
-                  on_progress: Callable[[int], bool] = lambda count: True) -> list[Track] | None:
+    def make_proposals(self, state: State, motion: Motion, frames: range | None = None,
+                       on_progress: Callable[[int], bool] = lambda count: True
+                       ) -> list[Track] | None:
         """Return proposed tracks in some frames (None: all) of a surveyed drive, or None if
         cancelled; on_progress as in propose_tracks()."""
-        seeds = [SilhouetteSeed(seed.silhouette(BEST), seed.height) for seed in self.seeds(state)]
+        seeds = [SilhouetteSeed(seed.silhouette(BEST), seed.height)
+                 for seed in self.find_seeds(state)]
         sizes = [SizeSeed(t.class_name, _track_size(t, f))
                  for f, t in self._find_size_seeds(state)]
         placed: dict[int, list[tuple[Array, str]]] = {}
@@ -146,7 +148,7 @@ class Proposer:
         return [(f, t) for f, t in found if f in t.boxes and t.class_name in CLASSES
                 and t.class_name != CLASSES[PEDESTRIAN]]
 
-    def seeds(self, state: State) -> list[Seed]:
+    def find_seeds(self, state: State) -> list[Seed]:
         """Return the pedestrian seeds of a state that have enough points."""
         found = [self._seed(state.tracks[t], f) for f, t in state.seeds if t in state.tracks]
         return [seed for seed in found if seed is not None]
@@ -166,7 +168,7 @@ class Proposer:
         except InputError:
             return None
 
-    def silhouettes(self, state: State, track: Track, frame: int) -> dict[str, Any]:
+    def compare_with_seed(self, state: State, track: Track, frame: int) -> dict[str, Any]:
         """Return the answer of /api/silhouettes: a track in a frame next to its most similar seed.
 
         Pedestrians are shown as silhouettes, other classes as side views. InputError if there is
@@ -174,7 +176,7 @@ class Proposer:
         """
         if track.class_name != CLASSES[PEDESTRIAN]:
             return self._compare_side_views(state, track, frame)
-        seeds = self.seeds(state)
+        seeds = self.find_seeds(state)
         if not seeds:
             raise InputError("there is no seed yet; click a pedestrian")
         box = track.boxes.get(frame)

@@ -147,7 +147,7 @@ def match_detections(truth: GroundTruth, found: Detections, min_score: float,
             "ignored": np.setdiff1d(counted, [*hits, *false]).tolist()}
 
 
-def detector_source(detector: Detector) -> Source:
+def make_detector_source(detector: Detector) -> Source:
     """Make a source that runs a detector on request and caches the result."""
     @lru_cache(maxsize=MAX_CACHED_FRAMES)
     def detect(i: int, frame: Frame) -> Detections:
@@ -155,7 +155,7 @@ def detector_source(detector: Detector) -> Source:
     return Source(detect, frozenset(detector.classes))
 
 
-def file_source(folder: Path) -> Source:
+def make_file_source(folder: Path) -> Source:
     """Make a source of KITTI result files: folder/NAME.txt, or a run of `detect` in `folder`.
 
     A frame without a file has no detections. InputError for an invalid file.

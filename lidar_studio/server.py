@@ -98,7 +98,7 @@ class Server:
         """Describe the drive or graph."""
         return web.json_response(self.content.to_json())
 
-    def frame(self, text: str) -> int:
+    def parse_frame(self, text: str) -> int:
         """Parse the number of a frame. InputError if there is no such frame."""
         first, end = self.content.drive.first, self.content.drive.end
         if not text.isascii() or not text.isdigit() or not first <= int(text[:9]) < end:
@@ -107,7 +107,7 @@ class Server:
 
     async def cloud(self, request: web.Request) -> web.StreamResponse:
         """Send the points of a frame, and prefetch those around it."""
-        i, drive = self.frame(request.match_info["i"]), self.content.drive
+        i, drive = self.parse_frame(request.match_info["i"]), self.content.drive
         load_scan = drive.load_scan
         body = await self.run_in_thread(lambda: load_scan(i).encode())
         ahead = 0 if self.content.live else PREFETCH_FRAMES
@@ -184,7 +184,7 @@ class Server:
 
     async def labels(self, request: web.Request) -> web.StreamResponse:
         """Send the labels and detections of a frame."""
-        i, layers = self.frame(request.match_info["i"]), self.content.layers
+        i, layers = self.parse_frame(request.match_info["i"]), self.content.layers
         if layers is None:
             return web.json_response({"labels": [], "detections": {}, "matches": {}})
         score = request.query.get("score", "0")
@@ -195,10 +195,10 @@ class Server:
         """Send the silhouettes of a track and of its most similar seed."""
         session = self.session
         track = require_track(session.state, _parse_number(request.query.get("track", "")))
-        frame = self.frame(request.query.get("frame", ""))
+        frame = self.parse_frame(request.query.get("frame", ""))
         try:
             return web.json_response(await self.run_in_thread(partial(
-                session.proposer.silhouettes, session.state, track, frame)))
+                session.proposer.compare_with_seed, session.state, track, frame)))
         except InputError as error:
             return _error_response(404, str(error))
 
@@ -208,7 +208,7 @@ class Server:
         track = find_next_uncertain(self.session.state, after,
                                     lambda track: only in (None, track.class_name))
         return web.json_response({"track": track and track.id,
-                                  "frame": track.nearest_frame() if track else 0})
+                                  "frame": track.find_nearest_frame() if track else 0})
 
     async def export(self, request: web.Request) -> web.StreamResponse:
         """Write the labels in another format."""

@@ -142,7 +142,7 @@ class Session:
                 with self._lock:
                     if self._worker is threading.current_thread():
                         self._task = ""
-                self.notify({"progress": self.progress()})
+                self.notify({"progress": self.get_progress()})
         self._worker = threading.Thread(target=run, daemon=True)
         self._worker.start()
 
@@ -171,12 +171,12 @@ class Session:
         self.proposer.load_cached()
         self._report_problem()
         if self.proposer.surveys is None:
-            complete = self.proposer.survey(report, in_process)
+            complete = self.proposer.run_survey(report, in_process)
             self._report_problem()
             if not complete:
                 return
         with self._lock:
-            if not self.state.poses and (poses := self.proposer.poses()) is not None:
+            if not self.state.poses and (poses := self.proposer.collect_scan_poses()) is not None:
                 self._record({"do": "poses", "poses": poses}, by)
         if again or self._has_waiting_clicks():
             self._propose_all(by, None, by_person)
@@ -190,14 +190,14 @@ class Session:
         """Report the number of finished frames; return False if the task is cancelled."""
         if self.busy is not None:
             self.busy = {**self.busy, "done": count}
-            self.notify({"progress": self.progress()})
+            self.notify({"progress": self.get_progress()})
         return not self._cancelled.is_set()
 
     def _propose_all(self, by: str, seed: int | None, by_person: bool = False) -> None:
         """Make proposals for the whole drive and record them. If the action number `seed` is still
         the last one, they become part of that action. Other actions may happen meanwhile."""
         state = self.state
-        found = self.proposer.proposals(state, self.motion, None, self._report_progress)
+        found = self.proposer.make_proposals(state, self.motion, None, self._report_progress)
         with self._lock:
             if found is None or self._cancelled.is_set() or (
                     seed is not None and not self._has_waiting_clicks()):
@@ -232,7 +232,7 @@ class Session:
             was_seed = track.source == CLICK and track.state == REJECTED
             if track.boxes and (was_seed or (name == "accept"
                                              and track.class_name == CLASSES[PEDESTRIAN])):
-                return {**action, "seed": track.nearest_frame()}
+                return {**action, "seed": track.find_nearest_frame()}
         return action
 
     def _complete_import(self, action: Action) -> Action:
@@ -292,7 +292,7 @@ class Session:
         count = len(self.drive.frames)
         nearby = range(max(frame - NEARBY_FRAMES, 0), min(frame + NEARBY_FRAMES + 1, count))
         is_long = count > 2 * NEARBY_FRAMES
-        found = self.proposer.proposals(state, self.motion, nearby if is_long else None)
+        found = self.proposer.make_proposals(state, self.motion, nearby if is_long else None)
         tracks, removed = merge_proposals(state, found or [], self.motion)
         if is_long:  # proposals for the nearby frames cannot replace tracks of the whole drive
             tracks = [t for t in tracks if t.id == track.id or t.id not in state.tracks]
@@ -337,28 +337,28 @@ class Session:
         shown = {k: v for k, v in action.items() if k not in ("tracks", "removed", "poses", "kept")
                  or action["do"] == "merge"}
         self.notify({"seq": self.state.seq, "by": by, "action": shown, "tracks": tracks,
-                     "removed": removed, **self.summary()})
+                     "removed": removed, **self.summarize()})
 
     def notify(self, event: dict[str, Any]) -> None:
         """Call all listeners with an event."""
         for listener in list(self.listeners):
             listener(event)
 
-    def progress(self) -> dict[str, Any]:
+    def get_progress(self) -> dict[str, Any]:
         """Counts of tracks and frames, and the state of the background task."""
         return {**count_progress(self.state, len(self.drive.frames)), "busy": self.busy}
 
-    def summary(self) -> dict[str, Any]:
+    def summarize(self) -> dict[str, Any]:
         """The state without the tracks, as in every event."""
         state = self.state
         return {"checked": sorted(state.checked), "seeds": [list(s) for s in state.seeds],
                 "can_undo": state.undo_stack is not None,
-                "can_redo": state.redo_stack is not None, "progress": self.progress()}
+                "can_redo": state.redo_stack is not None, "progress": self.get_progress()}
 
     def to_json(self) -> dict[str, Any]:
         """The answer of /api/state."""
         with self._lock:
-            return {"seq": self.state.seq, **self.summary(),
+            return {"seq": self.state.seq, **self.summarize(),
                     "tracks": [track_to_json(t) for t in self.state.tracks.values()]}
 
 

@@ -69,7 +69,7 @@ class Track:
         """1 at a score of 0.5, falling to 0 at scores of 0 and 1."""
         return 1.0 - 2.0 * abs(self.score - 0.5)
 
-    def nearest_frame(self) -> int:
+    def find_nearest_frame(self) -> int:
         """Return the frame in which the object is nearest to the sensor; 0 without boxes."""
         return min(self.boxes, key=lambda f: (math.hypot(*self.boxes[f].values[:2]), f), default=0)
 

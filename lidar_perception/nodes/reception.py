@@ -15,7 +15,7 @@ from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from lidar_perception.nodes.arrivals import DEPTH, WINDOW, Arrivals
-from lidar_perception.nodes.links import Output
+from lidar_perception.nodes.links import Links, Output
 from lidar_perception.nodes.rclpy_compat import InvalidHandle, parameter_overrides, take_messages
 from lidar_perception.nodes.shared_memory import SOCKET_BUFFER, read_socket_buffer_size
 from lidar_perception.params import ReceptionParams
@@ -53,7 +53,7 @@ class Reception:
     instead of a subscription, see links.py.
 
     Args:
-        node: the LidarNode that subscribes.
+        node: the node that subscribes, a LidarNode or a plain node, which has no links.
         kind: class of the message.
         name: name of the topic.
         deliver: called with each of the newest input.queue clouds, as CDR or as a message of a
@@ -68,6 +68,7 @@ class Reception:
                  deliver: Callable[[Any, bool], str | None],
                  params: Callable[[], ReceptionParams], what: str = "cloud"):
         self.node, self.kind, self.deliver, self.params = node, kind, deliver, params
+        self.links: Links | None = getattr(node, "links", None)
         self.what = what
         self.topic = node.resolve_topic_name(name)
         self.fixed = (f"qos_overrides.{self.topic}.subscription.reliability"
@@ -84,7 +85,7 @@ class Reception:
         self.waiting_since: float | None = None  # monotonic, of the first waiting cloud
         self.output: Output | None = None  # to which the topic is linked, without a subscription
         self.subscription: Any = None
-        self.last_publishers: list[Any] = []  # the present ones, if there are any
+        self.last_publishers: list[Any] = []  # the last ones, if there were any
         self.arrivals = Arrivals()
 
     @property
@@ -93,15 +94,15 @@ class Reception:
 
     def open(self) -> None:
         """Subscribe."""
-        if self.node.links is not None:
-            self.node.links.watch(self.topic, self._on_link_change)
+        if self.links is not None:
+            self.links.watch(self.topic, self._on_link_change)
         self._connect()
         self.adapt()
 
     def close(self) -> None:
         """End the subscription. Waiting clouds are dropped; later ones do not count as lost."""
-        if self.node.links is not None:
-            self.node.links.unwatch(self.topic, self._on_link_change)
+        if self.links is not None:
+            self.links.unwatch(self.topic, self._on_link_change)
         self._disconnect()
         self.last_time = None
         self.needs = self.needed_since = self.waiting_since = None
@@ -111,16 +112,16 @@ class Reception:
     def _connect(self) -> None:
         """Link to an output of this process, or subscribe."""
         self.output = self._find_output()
-        if self.output is None:
+        if self.output is None or self.links is None:
             self._subscribe()
         else:
             self.linked = deque(maxlen=max(DEPTH, self.params().queue))
             self.arrivals.depth = self.linked.maxlen or DEPTH
-            self.node.links.connect(self.output, self._receive)
+            self.links.connect(self.output, self._receive)
 
     def _disconnect(self) -> None:
-        if self.output is not None:
-            self.node.links.disconnect(self.output, self._receive)
+        if self.output is not None and self.links is not None:
+            self.links.disconnect(self.output, self._receive)
             self.linked.clear()
         if self.subscription is not None:
             self.node.destroy_subscription(self.subscription)
@@ -128,7 +129,7 @@ class Reception:
 
     def _find_output(self) -> Output | None:
         """Return the output of this process that is the only publisher of the topic, or None."""
-        output = self.node.links and self.node.links.find_output(self.topic)
+        output = None if self.links is None else self.links.find_output(self.topic)
         return output if output is not None and len(self.publishers()) < 2 else None
 
     def _subscribe(self) -> None:

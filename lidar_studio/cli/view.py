@@ -114,7 +114,7 @@ def _open_live_content(namespace: str, points: str,
                                   namespace.strip("/"))))
     live = LiveGraph(name)
     with run_live_view(live, None, namespace, points, detections):
-        yield PageContent(live, layers=live.layers, tracks=live.tracks)
+        yield PageContent(live, layers=live.layers, tracks=live.list_tracks)
 
 
 def _open_content(path: Path, detectors: tuple[DetectorChoice, ...], results: tuple[Path, ...],
@@ -141,9 +141,9 @@ def _open_content(path: Path, detectors: tuple[DetectorChoice, ...], results: tu
         found = result_sources.read_recorded_results(recording.frames.poses,
                                                      [f.stamp_ns for f in drive.frames])
     height = drive.frames[0].sensor_height
-    sources = {Path(choice.weights): result_sources.detector_source(
+    sources = {Path(choice.weights): result_sources.make_detector_source(
         choice.open(sensor_height=height)) for choice in detectors}
-    sources |= {folder.absolute(): result_sources.file_source(folder) for folder in results}
+    sources |= {folder.absolute(): result_sources.make_file_source(folder) for folder in results}
     names = make_short_names(list(sources), found.sources)
     found = result_sources.Results({**found.sources, **dict(zip(names, sources.values()))},
                                    found.tracks)

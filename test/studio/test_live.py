@@ -71,7 +71,7 @@ def test_frame_waits_for_its_boxes_and_late_ones_are_counted(live, monkeypatch):
     assert frames_told(live)[-2:] == [2, 2]
     row, = live.layers(2, 0.0)["detections"]["fused_detector"]
     assert row[:9] == [5, 0, 0, 1, 1, 1, 0, "Car", 0.5] and row[9] == {"pillars": 0.25}
-    assert [t["late"] for t in live.status()["topics"]] == [1]
+    assert [t["late"] for t in live.get_status()["topics"]] == [1]
 
 
 def test_early_boxes_wait_and_unmatched_ones_are_counted(live):
@@ -80,7 +80,7 @@ def test_early_boxes_wait_and_unmatched_ones_are_counted(live):
     assert len(live.layers(0, 0.0)["detections"]["fused_detector"]) == 1
     for stamp in range(1000, 1000 + live_graph.MAX_EARLY_ARRAYS + 3):
         live.add_boxes(FOUND, boxes(stamp), None)
-    topic, = live.status()["topics"]
+    topic, = live.get_status()["topics"]
     assert (topic["alone"], topic["late"]) == (3, 0)
 
 
@@ -109,7 +109,7 @@ def test_frames_stay_and_new_ones_are_counted_while_paused(live):
     live.set_held(1, False)
     for stamp in range(4, 20):
         live.add_cloud(cloud(stamp))
-    assert (live.first, live.end) == (0, 4) and live.status()["clouds"]["passed"] == 16
+    assert (live.first, live.end) == (0, 4) and live.get_status()["clouds"]["passed"] == 16
     live.set_held(2, False)
     live.add_cloud(cloud(20))
     assert live.end == 5
@@ -129,20 +129,20 @@ def test_early_labels_are_matched_when_a_bag_loops(live):
         live.add_boxes("/ground_truth/detections", boxes(stamp), None)
         live.add_cloud(cloud(stamp))
     assert all(len(live.layers(i, 0.0)["labels"]) == 1 for i in range(4))
-    assert live.status()["topics"][1]["alone"] == 0
+    assert live.get_status()["topics"][1]["alone"] == 0
 
 
 def test_missing_tf_is_reported_and_invalid_boxes_left_out(live):
     live.add_cloud(cloud(1))
     live.add_boxes(FOUND, boxes(1, "base_link"), None)
-    line, = live.status()["lines"]
+    line, = live.get_status()["lines"]
     assert FOUND in line and "TF does not connect 'base_link' with 'velodyne'" in line
     assert live.layers(0, 0.0)["detections"] == {}
     wrong = boxes(1, ids=(1, 2, 3, 4))
     wrong.boxes[0, 0], wrong.boxes[1, 4], wrong.scores[2] = np.nan, 0.0, np.inf
     live.add_boxes(FOUND, wrong, None)
     assert len(live.layers(0, 0.0)["detections"]["fused_detector"]) == 1
-    assert live.status()["lines"] == []
+    assert live.get_status()["lines"] == []
 
 
 def test_boxes_in_another_frame_are_transformed_once_tf_arrives(live, monkeypatch):
@@ -163,18 +163,18 @@ def test_boxes_in_another_frame_are_transformed_once_tf_arrives(live, monkeypatc
         live.add_boxes(TRACKED, from_marker_array(tracks), tracks)
         if i:
             live.add_boxes(FOUND, boxes(stamp), None)
-    assert frames_told(live)[-1] == 0 and live.status()["lines"] == []  # the other waits for TF
+    assert frames_told(live)[-1] == 0 and live.get_status()["lines"] == []  # the other waits for TF
     live.tree.set("odom", "base", 11 * second, [4, 0, 0], [0, 0, 0, 1])
     live.update()
     assert frames_told(live)[-1] == 1
-    track, = live.tracks()
+    track, = live.list_tracks()
     for row, frame in zip(track["boxes"], (0, 1), strict=True):
         np.testing.assert_allclose(row[1:8], boxes(0).boxes[0], atol=1e-6)
         np.testing.assert_allclose(track["trails"][frame], trail, atol=1e-3)
     monkeypatch.setattr(live_graph, "MAX_WAIT_S", 0.0)
     live.add_cloud(cloud(11 * second + second // 2))
     live.add_boxes(TRACKED, boxes(11 * second + second // 2, "odom"), None)
-    assert any("the newest transform" in line for line in live.status()["lines"])
+    assert any("the newest transform" in line for line in live.get_status()["lines"])
     live.add_boxes(FOUND, boxes(11 * second + second // 2), None)
     assert frames_told(live)[-1] == 2  # shown without
 
@@ -187,13 +187,13 @@ def test_two_trackers_have_distinct_ids_and_misses_are_known(live):
     for topic in (TRACKED, "/b/tracker/output/tracks", "/ground_truth/detections"):
         live.add_boxes(topic, boxes(1), None)
     live.add_boxes(FOUND, boxes(1, x=50.0), None)
-    assert len({t["id"] for t in live.tracks()}) == 2
+    assert len({t["id"] for t in live.list_tracks()}) == 2
     match = live.layers(0, 0.0)["matches"]["fused_detector"]
     assert match == {"missed": [0], "false": None, "ignored_labels": [], "ignored": None}
     live.forget_topic(TRACKED)  # another graph takes its place
     live.expect_topic("/c/tracker/output/tracks", TRACKS)
     live.add_boxes("/c/tracker/output/tracks", boxes(1), None)
-    assert len({t["id"] for t in live.tracks()}) == 2
+    assert len({t["id"] for t in live.list_tracks()}) == 2
 
 
 def test_cloud_with_most_columns_and_its_boxes_are_selected():
@@ -248,7 +248,7 @@ def test_requests_while_topics_change_are_thread_safe(live):
     def ask():
         while not over.is_set():
             try:
-                live.status(), live.frames(), live.tracks(), live.first
+                live.get_status(), live.list_frames(), live.list_tracks(), live.first
                 live.layers(live.end - 1, 0.0)
             except InputError:
                 pass  # no longer stored

@@ -129,7 +129,7 @@ def test_clicked_car_is_a_seed_and_similar_cars_are_proposed(session):
     assert other and all(t.class_name == "Car" and t.state == PROPOSED for t in other)
     scores = [t.score for t in sorted(other, key=lambda t: t.id)]
     assert scores == sorted(scores, reverse=True)
-    silhouettes = session.proposer.silhouettes(session.state, own, 0)
+    silhouettes = session.proposer.compare_with_seed(session.state, own, 0)
     assert silhouettes["similarity"] > 0.9 and "1" in silhouettes["seed"]["bits"]
 
 

@@ -27,7 +27,7 @@ from lidar_studio.results import (
     Results,
     Source,
     choose_points_topic,
-    file_source,
+    make_file_source,
     match_detections,
     read_recorded_results,
     read_recorded_scan,
@@ -179,7 +179,7 @@ def command_line(process: Path) -> str:
 
 def test_missing_result_folder_is_named(tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
-        file_source(tmp_path / "none")
+        make_file_source(tmp_path / "none")
 
 
 @pytest.mark.skipif(find_browser() is None, reason="chromium is not installed")
