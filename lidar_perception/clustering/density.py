@@ -27,16 +27,22 @@ def measure_density(xyz: np.ndarray) -> float:
     another in its cell of the view. KITTI's HDL-64E has 13 to 16, also in cropped clouds.
     """
     step = max(len(xyz) // MAX_SAMPLED, 1)
-    sampled = xyz[::step]
-    x, y, z = sampled.compress(usable_returns(sampled), axis=0).T
+    sampled = np.ascontiguousarray(xyz[::step])
+    usable = usable_returns(sampled)
+    if not usable.all():
+        sampled = sampled.take(np.flatnonzero(usable), axis=0)
+    if len(sampled) == 0:
+        return 0.0
+    x, y, z = np.ascontiguousarray(sampled.T)
     distance = np.hypot(x, y)
-    row = (np.degrees(np.arctan2(z, distance)) + 90.0) // CELL_DEG
-    column = (np.degrees(np.arctan2(y, x)) + 180.0) // CELL_DEG
+    # CELL_DEG is a power of two, so floor() equals the slower operator //.
+    row = np.floor((np.degrees(np.arctan2(z, distance)) + 90.0) / CELL_DEG)
+    column = np.floor((np.degrees(np.arctan2(y, x)) + 180.0) / CELL_DEG)
     cell = (row * (360.0 // CELL_DEG + 1.0) + column).astype(np.int64)
-    others = np.bincount(cell).take(cell) - 1.0 if len(cell) else np.zeros(0)
+    others = np.bincount(cell).take(cell) - 1.0
     # Cells narrow towards the zenith and the nadir.
     slant = np.maximum(distance / np.hypot(distance, z), 0.05)
-    return step * float((others / (CELL_DEG**2 * slant)).mean()) if len(cell) else 0.0
+    return step * float((others / (CELL_DEG**2 * slant)).mean())
 
 
 def adapt_to_density(params: ClusteringParams, density: float) -> ClusteringParams:
