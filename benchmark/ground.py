@@ -14,7 +14,7 @@ from benchmark.timing import SLOW_REPEAT, Clock, evenly_chosen, thin
 from lidar_perception.data.frame import Frame
 from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.params import ClothParams, GroundParams, ThresholdParams
-from lidar_perception.ground.patchwork import segment_by_patchwork, silence_stdout
+from lidar_perception.ground.patchwork import segment_by_patchwork
 from lidar_perception.ground.segment import METHODS
 from lidar_perception.ground.threshold import (
     fit_plane_by_ransac,
@@ -119,16 +119,15 @@ def measure_patchwork(frames: list[PointCloud], repeat: int) -> dict:
         return {name: partial(peers.PATCHWORK.run, cloud, SENSOR_HEIGHT),
                 "ours": partial(segment_by_patchwork, frame.xyz, frame.intensity, SENSOR_HEIGHT)}
 
-    same = 0
-    with silence_stdout():
+    same = differ = 0
+    with peers.silence_stdout():
         clock = Clock(repeat, calls(frames[0], _with_intensity(frames[0])))
         for frame in show_progress(frames, title, len(frames)):
             found = clock.time(calls(frame, _with_intensity(frame)))
-            same += np.array_equal(_mask(found[name], len(frame)), found["ours"])
-    ms = clock.medians()
+            apart = int((_mask(found[name], len(frame)) != found["ours"]).sum())
+            same, differ = same + (apart == 0), differ + apart
     return measured(title, len(frames), points, [
-        row(f"{name}, bare", peer_ms=ms[name], ours_ms=ms["ours"], value=ms["ours"] / ms[name],
-            unit="", target=1.1, same=same)])
+        against(name, clock.medians(), 1.3, same, differ)])
 
 
 def _with_intensity(frame: PointCloud) -> np.ndarray:
@@ -153,7 +152,7 @@ def measure_cloth(scans: list[np.ndarray], repeat: int) -> dict:
     def calls(xyz, precise):
         return {name: partial(peers.CLOTH.run, precise), "ours": partial(segment_by_cloth, xyz)}
 
-    with silence_stdout():
+    with peers.silence_stdout():
         clock = Clock(min(repeat, SLOW_REPEAT), calls(*_both(thin(scans[0]))))
         for xyz in show_progress(scans, title, len(scans)):
             clock.time(calls(*_both(xyz)))
@@ -178,7 +177,7 @@ def measure_labelled(frames: list[Frame], repeat: int) -> dict:
     def calls(frame):
         return {name: partial(methods[name], frame) for name in reports}
 
-    with silence_stdout():
+    with peers.silence_stdout():
         clock = None
         for item in show_progress(frames, "ground of labelled scans", len(frames)):
             frame, semantic = item.load(), item.point_truth().classes

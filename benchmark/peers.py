@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from unittest import mock
@@ -13,7 +16,6 @@ import numpy as np
 from lidar_perception.clustering.params import DbscanParams
 from lidar_perception.geometry import horizontal_range
 from lidar_perception.ground.params import ClothParams, PatchworkParams
-from lidar_perception.ground.patchwork import make_library_settings
 
 
 @dataclass(frozen=True)
@@ -112,11 +114,31 @@ RANSAC_2000 = Peer("scikit-learn, 2000 trials", "scikit-learn", "sklearn", ransa
 
 # Ground. Both print on file descriptor 1.
 
+@contextmanager
+def silence_stdout() -> Iterator[None]:
+    """Discard output to file descriptor 1, to which C++ libraries write without sys.stdout."""
+    sys.stdout.flush()
+    saved, null = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 1)
+        yield
+    finally:
+        os.dup2(saved, 1)
+        os.close(saved)
+        os.close(null)
+
+
 def _bare_patchwork(points: np.ndarray, sensor_height: float,
                     params: PatchworkParams = PatchworkParams()) -> np.ndarray:
-    """Indices of the ground among points (N, 4) float32, by a new object."""
+    """Return the indices of the ground among points (N, 4) float32, by a new object."""
     import pypatchworkpp
-    engine = pypatchworkpp.patchworkpp(make_library_settings(sensor_height, params))
+    settings = pypatchworkpp.Parameters()
+    settings.sensor_height = sensor_height
+    settings.min_range, settings.max_range = params.min_range, params.max_range
+    settings.th_dist, settings.th_seeds = params.inlier_distance, params.seed_distance
+    settings.uprightness_thr = params.uprightness
+    settings.enable_RNR = params.remove_reflections
+    engine = pypatchworkpp.patchworkpp(settings)
     engine.estimateGround(points)
     return engine.getGroundIndices()
 

@@ -65,7 +65,7 @@ def print_measured(content: dict) -> None:
     console.print(table)
     for r in content["rows"]:
         if r["differ"]:
-            console.print(f"{r['name']}: {r['differ']} points are noise for one and not the other")
+            console.print(f"{r['name']}: {r['differ']} points have other labels")
 
 
 def print_ground(content: dict) -> None:

@@ -36,7 +36,7 @@ STRANGERS = {
     "runs": ["rich", "jinja2", "threadpoolctl", "numba"],
     "wire": ["numpy", "scipy", "rosbags", "msg_utils", "lz4", "zstandard"],
     "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils", "lz4", "zstandard"],
-    "ground": [*NUMBERS, "pypatchworkpp"], "clustering": NUMBERS, "candidates": NUMBERS,
+    "ground": NUMBERS, "clustering": NUMBERS, "candidates": NUMBERS,
     "detectors": [*NUMBERS, "llvmlite", "torch", "safetensors", "onnx", "onnxruntime",
                   "onnxscript"],
     "tracking": [*NUMBERS, "kiss_icp"],

@@ -1,27 +1,58 @@
-"""Ground by the Patchwork++ library (Lee, Lim, Myung, IROS 2022), as in paper B's V1."""
+"""Ground by Patchwork++ (Lee, Lim, Myung, IROS 2022), as in paper B's V1.
+
+The labels are those of the authors' library (pypatchworkpp 1.4.1) for one cloud, except for a few
+points within rounding of a limit. Unlike the library, this code releases the GIL and prints
+nothing. The library adapts limits from cloud to cloud; this is left out, so a cloud always has the
+same ground.
+"""
 
 from __future__ import annotations
 
-import os
-import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+import math
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
+from lidar_perception.geometry import counting_sort
 from lidar_perception.ground.params import PatchworkParams
-from lidar_perception.types import InputError
 
-_stdout_lock = threading.RLock()  # reentrant, because a caller may silence a whole run
+# Constants of the library, with their names there.
+RINGS, SECTORS = (2, 4, 4, 4), (16, 32, 54, 32)  # of each zone: num_rings_each_zone, ...sectors...
+PATCHES = sum(rings * sectors for rings, sectors in zip(RINGS, SECTORS))
+MIN_PATCH_POINTS = 10    # num_min_pts
+ITERATIONS = 3           # num_iter
+LOWEST_POINTS = 20       # num_lpr, whose mean is the lowest height of a patch
+NEAR_RINGS = 4           # num_rings_of_interest
+MIN_SEED_HEIGHT = -1.2   # adaptive_seed_selection_margin, in sensor heights
+VERTICAL_SEED_DISTANCE, VERTICAL_DISTANCE = 0.25, 0.1  # th_seeds_v, th_dist_v, metres
+MAX_NOISE_DEG, MAX_NOISE_INTENSITY = -15.0, 0.2        # RNR_ver_angle_thr, RNR_intensity_thr
+MIN_NOISE_DEPTH = 0.8    # of reflections, metres below the ground
+MAX_LINE_RATIO = 8.0     # of the eigenvalues of a patch that may be reverted
+MANY_POINTS = 1500       # a flat patch with more points is reverted
+
+OTHER, GROUND, REMOVED = 0, 1, 2  # states of a point in its patch
+
+
+class _Settings(NamedTuple):
+    """Parameters for compiled code; metres, least z of a normal."""
+
+    sensor_height: float
+    min_range: float
+    max_range: float
+    inlier_distance: float
+    seed_distance: float
+    uprightness: float
+
+
+# A plane of ground points is an array (8,) float64: normal and offset (normal . p + offset = 0),
+# mean height of the points, and eigenvalues of their covariance.
+OFFSET, MEAN_Z, LARGEST, MIDDLE, SMALLEST = 3, 4, 5, 6, 7
 
 
 def segment_by_patchwork(xyz: np.ndarray, intensity: np.ndarray | None, sensor_height: float,
                          params: PatchworkParams = PatchworkParams()) -> np.ndarray:
     """Segment the ground of finite points.
-
-    The library's running average over clouds is reset, so that a cloud always has the same ground.
 
     Args:
         xyz: (N, 3) float32 with z up.
@@ -30,52 +61,285 @@ def segment_by_patchwork(xyz: np.ndarray, intensity: np.ndarray | None, sensor_h
 
     Returns:
         (N,) bool, True = ground.
-
-    Raises:
-        InputError: if the library is not installed.
     """
-    try:
-        import pypatchworkpp
-    except ImportError:
-        raise InputError("ground.method 'patchwork' needs the package pypatchworkpp: pip install "
-                         "pypatchworkpp, or choose threshold or cloth") from None
-    settings = make_library_settings(sensor_height, params)
-    settings.enable_RNR = params.remove_reflections and intensity is not None
-    points = np.empty((len(xyz), 4), np.float32)
-    points[:, :3] = xyz
-    points[:, 3] = 0.0 if intensity is None else intensity
-    ground = np.zeros(len(xyz), bool)
-    with silence_stdout():
-        engine = pypatchworkpp.patchworkpp(settings)
-        if len(xyz):
-            engine.estimateGround(points)
-            ground[engine.getGroundIndices()] = True
+    settings = _Settings(float(sensor_height), float(params.min_range), float(params.max_range),
+                         float(params.inlier_distance), float(params.seed_distance),
+                         float(params.uprightness))
+    known = params.remove_reflections and intensity is not None
+    return _segment(np.array(xyz, np.float32, order="C"),
+                    np.array(intensity if known else (), np.float32), settings)
+
+
+@njit(cache=True, nogil=True)
+def _segment(xyz, intensity, settings):
+    order, start = counting_sort(_find_patches(xyz, intensity, settings), PATCHES + 1,
+                                 np.arange(len(xyz)))
+    largest = 0
+    for p in range(PATCHES):
+        largest = max(largest, start[p + 1] - start[p])
+    points, state = np.empty((3, largest), np.float32), np.empty(largest, np.int8)
+    ground = np.zeros(len(xyz), np.bool_)
+    plane = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    flatness = np.empty(PATCHES)
+    doubtful, sizes = np.empty(PATCHES, np.int64), np.empty(PATCHES, np.int64)
+    values = np.empty((PATCHES, 3))  # eigenvalues of doubtful patches
+    p, ring = 0, 0
+    for zone in range(len(RINGS)):
+        for _ in range(RINGS[zone]):
+            flat_count, count = 0, 0
+            for _ in range(SECTORS[zone]):
+                begin, size = start[p], start[p + 1] - start[p]
+                p += 1
+                if size < MIN_PATCH_POINTS:
+                    continue
+                for i in range(size):
+                    for axis in range(3):
+                        points[axis, i] = xyz[order[begin + i], axis]
+                _fit_ground(points, state, size, zone, plane, settings)
+                # Ground likelihood estimation (GLE)
+                near, low = ring < NEAR_RINGS, plane[MEAN_Z] < 0.0
+                if not plane[2] > settings.uprightness:
+                    continue
+                if near and low:
+                    flatness[flat_count] = plane[SMALLEST]
+                    flat_count += 1
+                if near and not plane[OFFSET] > 0.0:
+                    continue  # the sensor is below the plane
+                sizes[count] = 0
+                for i in range(size):
+                    ground[order[begin + i]] = state[i] == GROUND
+                    sizes[count] += state[i] == GROUND
+                if near and not low:
+                    doubtful[count] = p - 1
+                    for k in range(3):
+                        values[count, k] = plane[LARGEST + k]
+                    count += 1
+            limit = _flatness_limit(flatness, flat_count)
+            for c in range(count):  # Temporal ground revert (TGR)
+                flat = values[c, 2] < limit or (
+                    sizes[c] > MANY_POINTS and values[c, 2] < settings.inlier_distance**2)
+                if not flat or values[c, 0] > MAX_LINE_RATIO * values[c, 1]:
+                    for i in range(start[doubtful[c]], start[doubtful[c] + 1]):
+                        ground[order[i]] = False
+            ring += 1
     return ground
 
 
-def make_library_settings(sensor_height: float, params: PatchworkParams) -> Any:
-    """Return the library's Parameters object."""
-    import pypatchworkpp
-    settings = pypatchworkpp.Parameters()
-    settings.verbose = False
-    settings.sensor_height = sensor_height
-    settings.min_range, settings.max_range = params.min_range, params.max_range
-    settings.th_dist, settings.th_seeds = params.inlier_distance, params.seed_distance
-    settings.uprightness_thr = params.uprightness
-    settings.enable_RNR = params.remove_reflections
-    return settings
+@njit(cache=True, nogil=True)
+def _find_patches(xyz, intensity, settings):
+    """Return the patch (N,) of each point in the concentric zones (CZM), ring by ring; PATCHES for
+    reflections (RNR) and for points out of range."""
+    nearest, farthest = settings.min_range, settings.max_range
+    limits = (nearest, (7 * nearest + farthest) / 8, (3 * nearest + farthest) / 4,
+              (nearest + farthest) / 2, farthest)
+    patch = np.full(len(xyz), PATCHES)
+    max_noise = math.tan(math.radians(MAX_NOISE_DEG))
+    for i in range(len(xyz)):
+        x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
+        distance = math.sqrt(x * x + y * y)
+        if len(intensity) and (intensity[i] < MAX_NOISE_INTENSITY and z < max_noise * distance
+                               and z < -settings.sensor_height - MIN_NOISE_DEPTH):
+            continue
+        if not nearest < distance <= farthest:
+            continue
+        angle = math.atan2(y, x)
+        angle = angle if angle > 0 else 2 * math.pi + angle
+        zone, first = 0, 0
+        while zone < 3 and distance >= limits[zone + 1]:
+            first += RINGS[zone] * SECTORS[zone]
+            zone += 1
+        width = (limits[zone + 1] - limits[zone]) / RINGS[zone]
+        ring = min(int((distance - limits[zone]) / width), RINGS[zone] - 1)
+        sector = min(int(angle / (2 * math.pi / SECTORS[zone])), SECTORS[zone] - 1)
+        patch[i] = first + ring * SECTORS[zone] + sector
+    return patch
 
 
-@contextmanager
-def silence_stdout() -> Iterator[None]:
-    """Discard output to file descriptor 1, to which C++ libraries write without sys.stdout."""
-    with _stdout_lock:
-        sys.stdout.flush()
-        saved, null = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-        try:
-            os.dup2(null, 1)
-            yield
-        finally:
-            os.dup2(saved, 1)
-            os.close(saved)
-            os.close(null)
+@njit(cache=True, nogil=True)
+def _fit_ground(points, state, size, zone, plane, settings):
+    """Fit the ground of a patch: set the states of its points (3, >= size), and the plane.
+
+    The plane is left as it is, that of the patch before, if there are no points to fit it to.
+    """
+    for i in range(size):
+        state[i] = OTHER
+    min_height = MIN_SEED_HEIGHT * settings.sensor_height if zone == 0 else -np.inf
+    for _ in range(ITERATIONS):  # Region-wise vertical plane fitting (R-VPF)
+        _mark_seeds(points, state, size, min_height, VERTICAL_SEED_DISTANCE)
+        _fit_plane(points, state, size, plane)
+        if zone > 0 or not plane[2] < settings.uprightness:
+            break
+        for i in range(size):
+            if state[i] != REMOVED and abs(_distance(plane, points, i)) < VERTICAL_DISTANCE:
+                state[i] = REMOVED
+    _mark_seeds(points, state, size, min_height, settings.seed_distance)
+    _fit_plane(points, state, size, plane)
+    for _ in range(ITERATIONS):  # Region-wise ground plane fitting (R-GPF)
+        for i in range(size):
+            if state[i] != REMOVED:
+                below = _distance(plane, points, i) < settings.inlier_distance
+                state[i] = GROUND if below else OTHER
+        _fit_plane(points, state, size, plane)
+
+
+@njit(cache=True, nogil=True)
+def _mark_seeds(points, state, size, min_height, distance):
+    """Mark the points less than `distance` above the mean of the lowest ones."""
+    lowest, count = np.empty(LOWEST_POINTS), 0  # ascending
+    for i in range(size):
+        z = points[2, i]
+        if state[i] == REMOVED or z < min_height or (count == LOWEST_POINTS and z >= lowest[-1]):
+            continue
+        at = count if count < LOWEST_POINTS else count - 1
+        while at > 0 and lowest[at - 1] > z:
+            lowest[at] = lowest[at - 1]
+            at -= 1
+        lowest[at] = z
+        count = min(count + 1, LOWEST_POINTS)
+    total = 0.0
+    for k in range(count):
+        total += lowest[k]
+    limit = distance + total / max(count, 1)
+    for i in range(size):
+        if state[i] != REMOVED:
+            state[i] = GROUND if points[2, i] < limit else OTHER
+
+
+@njit(cache=True, nogil=True)
+def _distance(plane, points, i):
+    return np.float32(plane[0] * points[0, i] + plane[1] * points[1, i]
+                      + plane[2] * points[2, i]) + plane[OFFSET]
+
+
+@njit(cache=True, nogil=True)
+def _fit_plane(points, state, size, plane):
+    """Set the plane to that of the ground points of a patch, if there are any."""
+    count, sx, sy, sz = 0, 0.0, 0.0, 0.0
+    for i in range(size):
+        if state[i] == GROUND:
+            count += 1
+            sx, sy, sz = sx + points[0, i], sy + points[1, i], sz + points[2, i]
+    if count == 0:
+        return
+    # Rounded to float32 as in the library, which decides about planes through two points.
+    mean = np.array([sx / count, sy / count, sz / count], np.float32)
+    xx, xy, yy, xz, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(size):
+        if state[i] == GROUND:
+            x, y, z = points[0, i] - mean[0], points[1, i] - mean[1], points[2, i] - mean[2]
+            xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
+            xz, yz, zz = xz + x * z, yz + y * z, zz + z * z
+    cov = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], np.float32)
+    for k in range(3):
+        for j in range(3):
+            cov[k, j] /= np.float32(max(count - 1, 1))
+    _decompose(cov, plane)
+    if plane[2] < 0:
+        for k in range(3):
+            plane[k] = -plane[k]
+    plane[MEAN_Z], plane[OFFSET] = mean[2], 0.0
+    for k in range(3):
+        plane[OFFSET] -= plane[k] * mean[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _decompose(matrix, plane):
+    """Write the eigenvalues of a symmetric matrix (3, 3) float32 and the eigenvector of the least
+    one into a plane; the matrix is overwritten.
+
+    As in Eigen's SelfAdjointEigenSolver.computeDirect, whose result for planes through two points
+    decides about them. Also, it takes a third of the time of Jacobi rotations.
+    """
+    m, epsilon = matrix, np.float32(2.0**-23)
+    shift = (m[0, 0] + m[1, 1] + m[2, 2]) / np.float32(3.0)
+    scale = np.float32(0.0)
+    for k in range(3):
+        m[k, k] -= shift
+        for j in range(3):
+            scale = max(scale, abs(m[k, j]))
+    if scale > 0:
+        for k in range(3):
+            for j in range(3):
+                m[k, j] /= scale
+    low, middle, high = _eigenvalues(m)
+    plane[LARGEST], plane[MIDDLE], plane[SMALLEST] = (
+        high * scale + shift, middle * scale + shift, low * scale + shift)
+    normal, column = np.zeros(3, np.float32), np.empty(3, np.float32)
+    if high - low <= epsilon:
+        normal[0] = 1.0
+    elif high - middle <= middle - low:
+        _find_kernel(m, low, normal, column)
+    else:
+        _find_kernel(m, high, column, normal)
+        if middle - low <= 0:  # the column found is close to the eigenvector
+            share = np.float32(1.0) - (column[0] * normal[0] + column[1] * normal[1]
+                                       + column[2] * normal[2])
+            length = np.float32(0.0)
+            for k in range(3):
+                normal[k] *= share
+                length += normal[k] * normal[k]
+            for k in range(3):
+                normal[k] /= np.sqrt(length)
+        else:
+            _find_kernel(m, low, normal, column)
+    for k in range(3):
+        plane[k] = normal[k]
+
+
+@njit(cache=True, nogil=True)
+def _eigenvalues(m):
+    """Return the eigenvalues of a symmetric matrix (3, 3) float32 with trace 0, ascending."""
+    zero, half, two = np.float32(0.0), np.float32(0.5), np.float32(2.0)
+    third, root = np.float32(1.0 / 3.0), np.float32(3.0**0.5)
+    c0 = (m[0, 0] * m[1, 1] * m[2, 2] + two * m[1, 0] * m[2, 0] * m[2, 1]
+          - m[0, 0] * m[2, 1] * m[2, 1] - m[1, 1] * m[2, 0] * m[2, 0]
+          - m[2, 2] * m[1, 0] * m[1, 0])
+    c1 = (m[0, 0] * m[1, 1] - m[1, 0] * m[1, 0] + m[0, 0] * m[2, 2] - m[2, 0] * m[2, 0]
+          + m[1, 1] * m[2, 2] - m[2, 1] * m[2, 1])
+    c2 = m[0, 0] + m[1, 1] + m[2, 2]
+    mean = c2 * third
+    a = max((c2 * mean - c1) * third, zero)
+    b = half * (c0 + mean * (two * mean * mean - c1))
+    angle = math.atan2(np.sqrt(max(a * a * a - b * b, zero)), b) * third
+    radius, cos, sin = np.sqrt(a), math.cos(angle), math.sin(angle)
+    return (mean - radius * (cos + root * sin), mean - radius * (cos - root * sin),
+            mean + two * radius * cos)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_kernel(m, eigenvalue, kernel, column):
+    """Set kernel (3,) to the eigenvector of an eigenvalue of m (3, 3), and column (3,) to the
+    column of m - eigenvalue with the largest entry on the diagonal; all float32."""
+    top = 0
+    for k in range(1, 3):
+        top = k if abs(m[k, k] - eigenvalue) > abs(m[top, top] - eigenvalue) else top
+    for k in range(3):
+        column[k] = m[k, top] - (eigenvalue if k == top else np.float32(0.0))
+    best = np.float32(-1.0)
+    for step in range(1, 3):
+        other = (top + step) % 3
+        x, y, z = m[0, other], m[1, other], m[2, other]
+        x -= eigenvalue if other == 0 else np.float32(0.0)
+        y -= eigenvalue if other == 1 else np.float32(0.0)
+        z -= eigenvalue if other == 2 else np.float32(0.0)
+        u = column[1] * z - column[2] * y
+        v = column[2] * x - column[0] * z
+        w = column[0] * y - column[1] * x
+        length = u * u + v * v + w * w
+        if step == 1 or not best > length:
+            best = length
+            kernel[0], kernel[1], kernel[2] = (u / np.sqrt(length), v / np.sqrt(length),
+                                               w / np.sqrt(length))
+
+
+@njit(cache=True, nogil=True)
+def _flatness_limit(flatness, count):
+    """Return the largest flatness of a patch that is reverted to ground; 0 for fewer than two."""
+    if count < 2:
+        return 0.0
+    total, squares = 0.0, 0.0
+    for i in range(count):
+        total += flatness[i]
+    for i in range(count):
+        squares += (flatness[i] - total / count) ** 2
+    return total / count + 1.5 * math.sqrt(squares / (count - 1))

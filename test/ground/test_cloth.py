@@ -19,7 +19,6 @@ from lidar_perception.ground.cloth_slopes import (
 )
 from lidar_perception.ground.cloth_solver import settle_sheet
 from lidar_perception.ground.params import ClothParams
-from lidar_perception.ground.patchwork import silence_stdout
 from lidar_perception.scoring.points.segmentation import (
     PROTOCOLS,
     count_ground,
@@ -225,14 +224,13 @@ def test_a_real_scan_is_segmented_as_well_as_by_csf():
     labelled = open_recording(DATA / "semantickitti").frames[0]
     frame, semantic = labelled.load(), labelled.point_truth().classes
     params = ClothParams()
-    with silence_stdout():
-        peer = CSF.CSF()
-        peer.params.bSloopSmooth = False
-        peer.params.cloth_resolution = params.resolution
-        peer.params.class_threshold = params.class_threshold
-        peer.setPointCloud(frame.xyz.astype(np.float64))
-        inside, outside = CSF.VecInt(), CSF.VecInt()
-        peer.do_filtering(inside, outside, False)
+    peer = CSF.CSF()
+    peer.params.bSloopSmooth = False
+    peer.params.cloth_resolution = params.resolution
+    peer.params.class_threshold = params.class_threshold
+    peer.setPointCloud(frame.xyz.astype(np.float64))
+    inside, outside = CSF.VecInt(), CSF.VecInt()
+    peer.do_filtering(inside, outside, False)
     theirs = np.zeros(len(frame), bool)
     theirs[np.array(inside)] = True
     ours = segment_by_cloth(frame.xyz, params)

@@ -14,10 +14,10 @@ from lidar_perception.ground.params import (
     PatchworkParams,
     SensorPoseParams,
 )
+from lidar_perception.ground.patchwork import segment_by_patchwork
 from lidar_perception.ground.segment import METHODS, level_points, segment_ground
 from lidar_perception.types import PointCloud
 
-pypatchworkpp = pytest.importorskip("pypatchworkpp")
 each_method = pytest.mark.parametrize("method", GROUND_METHODS)
 
 
@@ -108,7 +108,8 @@ def test_pitch_and_roll_rotate_as_in_a_urdf():
     assert level_points(xyz, SensorPoseParams()) is xyz
 
 
-def bare_patchwork(xyz, intensity, height=1.73, rnr=True):
+def run_library(xyz, intensity, height=1.73, rnr=True):
+    pypatchworkpp = pytest.importorskip("pypatchworkpp")
     settings = pypatchworkpp.Parameters()
     settings.sensor_height, settings.enable_RNR = height, rnr
     engine = pypatchworkpp.patchworkpp(settings)
@@ -118,20 +119,44 @@ def bare_patchwork(xyz, intensity, height=1.73, rnr=True):
     return found
 
 
+def hilly_scene(seed):
+    """Return points (N, 3) on slopes, raised plates, walls and reflections below the ground, with
+    the intensity (N,): everything that Patchwork++ tells apart."""
+    rng = np.random.default_rng(seed)
+    distance, angle = 3 + 70 * rng.random(60_000) ** 2, rng.uniform(-np.pi, np.pi, 60_000)
+    x, y = distance * np.cos(angle), distance * np.sin(angle)
+    z = -1.73 + 0.6 * np.sin(x / 15) + 0.02 * y + rng.normal(0, 0.02, len(x))
+    plate = np.floor(x / 6) + 7 * np.floor(y / 6)
+    z += np.where(plate % 5 == 0, 2.2, 0.0)              # roofs of cars, hedges
+    wall = plate % 7 == 3
+    z[wall] = rng.uniform(-1.7, 2.0, wall.sum())
+    x[wall] = 6 * np.floor(x[wall] / 6) + rng.normal(0, 0.02, wall.sum())
+    below = rng.random(len(x)) < 0.02
+    z[below] -= 2.0
+    return np.column_stack([x, y, z]).astype(np.float32), rng.random(len(x)).astype(np.float32)
+
+
+@pytest.mark.parametrize("rnr", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_patchwork_equals_the_library_but_for_rounding(seed, rnr):
+    xyz, intensity = hilly_scene(seed)
+    expected = run_library(xyz, intensity, rnr=rnr)
+    found = segment_by_patchwork(xyz, intensity if rnr else None, 1.73)
+    assert 0.2 < expected.mean() < 0.8
+    assert (found != expected).mean() < 1e-4
+
+
 @needs_data
-def test_patchwork_equals_the_library_and_is_silent(capfd):
+def test_patchwork_equals_the_library_on_a_real_scan():
     frame = open_recording(DATA / "semantickitti").frames[0].load()
     params = GroundParams(method="patchwork")
-    found = [segment_ground(frame, params) for _ in range(3)]  # no state between clouds
-    assert capfd.readouterr().out == ""
-    with_rnr, without = (bare_patchwork(frame.xyz, frame.intensity, rnr=r) for r in (True, False))
-    assert (with_rnr != without).any()
-    for mask in found:
-        np.testing.assert_array_equal(mask, with_rnr)
-    no_intensity = PointCloud(frame.xyz)
-    np.testing.assert_array_equal(segment_ground(no_intensity, params), without)
     off = GroundParams(method="patchwork", patchwork=PatchworkParams(remove_reflections=False))
-    np.testing.assert_array_equal(segment_ground(frame, off), without)
+    with_rnr, without = (run_library(frame.xyz, frame.intensity, rnr=r) for r in (True, False))
+    assert (with_rnr != without).any()
+    for found, expected in ((segment_ground(frame, params), with_rnr),
+                            (segment_ground(PointCloud(frame.xyz), params), without),
+                            (segment_ground(frame, off), without)):
+        assert (found != expected).sum() <= 20  # of 124,668; points within rounding of a limit
 
 
 @needs_data
