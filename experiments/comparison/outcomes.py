@@ -1,7 +1,7 @@
 """Scores and times of all detectors on the same frames.
 
-Detectors take turns: each frame starts with another one, so that whatever slows the machine, or
-warms its caches, affects all of them equally.
+Detectors take turns: each frame starts with another detector, so that a slow machine or warm caches
+affect all of them equally.
 """
 
 from __future__ import annotations

@@ -34,6 +34,7 @@ from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.matching import RANGE_NAMES
 from lidar_perception.scoring.centres.report import CandidateReport, measure_frame
+from lidar_perception.training.frames import may_have_labels
 from lidar_perception.types import InputError
 
 MAX_SCANS = 500  # taken evenly from a larger recording
@@ -103,7 +104,7 @@ def select_frames(recording: Recording) -> list[Frame]:
     count = min(len(recording), MAX_SCANS)
     chosen = np.linspace(0, len(recording) - 1, count).astype(int)
     frames = [recording.frames[i] for i in chosen]
-    if not any(map(_may_have_labels, frames)):
+    if not any(map(may_have_labels, frames)):
         raise InputError(f"{recording.path} has no labels; give the training folder with label_2 "
                          "(object) or label_02 (tracking), or a raw drive with tracklets")
     return frames
@@ -159,13 +160,6 @@ def compute_factor(bin_row: dict) -> float:
     if not value:
         return 1.0 if bin_row["within"] else math.inf
     return max(value, 1 / value)
-
-
-def _may_have_labels(frame: Frame) -> bool:
-    try:
-        return frame.truth() is not None
-    except InputError:  # reported when the scan is measured
-        return True
 
 
 def _compare_bins(curve: Curve, name: str, real: dict, simulated: dict) -> dict:

@@ -60,14 +60,6 @@ class Actor:
 X, Y, HEADING, LENGTH, WIDTH, SPEED, START, STOP = range(8)
 
 
-def compute_centres(footprints: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return centres (M, T, 2) of footprints (M, 8) at times t (M, T) or (T,)."""
-    f = footprints[:, None]
-    way = f[..., SPEED] * np.clip(t - f[..., START], 0.0, f[..., STOP] - f[..., START])
-    return np.stack([f[..., X] + np.cos(f[..., HEADING]) * way,
-                     f[..., Y] + np.sin(f[..., HEADING]) * way], axis=-1)
-
-
 @njit(cache=True, nogil=True)
 def _touches_any(one, many, reach, seconds, gap):
     """Return True if one touches any of many; reach (M,): _max_reach of these."""

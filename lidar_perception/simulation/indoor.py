@@ -34,8 +34,8 @@ class IndoorKind:
     """
 
     share: float                  # of the scenes
-    wide: tuple[float, float]     # from the trajectory to the walls beside it
-    ends: tuple[float, float]     # and to those behind and ahead
+    wide: tuple[float, float]     # from the trajectory to the side walls
+    ends: tuple[float, float]     # and to the walls behind and ahead
     height: tuple[float, float]
     walls: dict[str, float]       # weights of their pieces, see WALLS
     fill: tuple[str, ...]         # furniture, see FILLS

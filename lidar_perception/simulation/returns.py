@@ -13,8 +13,8 @@ from lidar_perception.simulation.solids import RETROREFLECTOR
 # Grazing incidence weakens a return by a power of the cosine of the incidence, and the logarithm of
 # the power scatters. With these values the road is lost as ahead of KITTI's car, where in 27 scans
 # (median) 0.7 of the rays return from 38 m, 0.5 from 43 m, 0.35 from 50 m and none from 60 m.
-# Losses come in runs: on a SemanticKITTI scan only 0.03 of the road's returns beyond 35 m are
-# missing between others.
+# Lost returns are adjacent: on a SemanticKITTI scan only 0.03 of the road's returns beyond 35 m are
+# missing singly.
 GRAZING_EXPONENT = 1 / 3
 POWER_SCATTER, SCATTER_COLUMNS = 0.5, 16  # standard deviation; columns of a run
 # Neighbouring points of one beam differ as much on the road, sidewalks (0.03) and facades (0.04) of

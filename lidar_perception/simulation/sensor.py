@@ -290,18 +290,6 @@ SENSOR_NAMES = tuple(path.stem for path in PRESET_FILES.values())
 GENERIC_FORMAT = "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE (degrees, turns a second)"
 
 
-def make_hdl64e(rate: float = 10.0) -> Sensor:
-    """Return KITTI's HDL-64E S2 at a rate of 5 to 20 turns per second.
-
-    The lasers fire at a fixed rate, so a slower turn has a finer azimuth step. Raises InputError
-    for another rate.
-    """
-    if not 5 <= rate <= 20:
-        raise InputError(f"impossible sensor: rate {rate} must be 5 .. 20 turns per second")
-    columns = round(HDL64E.columns * HDL64E.rate / rate)
-    return replace(HDL64E, azimuth_step=2 * np.pi / columns, rate=rate)
-
-
 def find_sensor(name: str, height: float = 0.0) -> Sensor:
     """Return the sensor of a name, which may be a preset, a YAML file or a generic sensor.
 

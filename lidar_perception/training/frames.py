@@ -64,7 +64,7 @@ class LabelledFrames:
             InputError: There are fewer than two frames.
         """
         if self.drives:
-            labelled = [frame for frame in self.frames if _may_have_labels(frame)] or self.frames
+            labelled = [frame for frame in self.frames if may_have_labels(frame)] or self.frames
             runs = [[labelled[i] for i in run] for several in split_drives(labelled).values()
                     for run in several]
             names = {frame.name for frame in draw_drives(runs, share, seed)}
@@ -104,8 +104,8 @@ def _find_height(recording: Recording, height: float, mixed: bool) -> float | No
     return None if measured is recording else next(iter(measured)).sensor_height
 
 
-def _may_have_labels(frame: Frame) -> bool:
-    """Return True for broken labels too, which are reported when they are read."""
+def may_have_labels(frame: Frame) -> bool:
+    """Return True if a frame has labels, or broken ones, which are reported when they are read."""
     try:
         return frame.truth() is not None
     except InputError:

@@ -166,11 +166,11 @@ def test_detectors_take_turns(tmp_path):
         assert all(sorted(order) == items for order in orders)
         for place in range(count):
             assert sorted(order[place] for order in orders) == sorted(2 * items)
-    said = []
+    calls = []
     compute_report(object_folder(tmp_path, walker_label(), count=3),
-          *(lambda frame, i=i: said.append((frame.name, i)) for i in range(3)))
-    first, *rest = (said[i:i + 3] for i in range(0, len(said), 3))
-    assert first == rest[0] and len(rest) == 3  # the first frame once more before it counts
+                   *(lambda frame, i=i: calls.append((frame.name, i)) for i in range(3)))
+    first, *rest = (calls[i:i + 3] for i in range(0, len(calls), 3))
+    assert first == rest[0] and len(rest) == 3  # the first frame runs twice
     assert [frame[0][1] for frame in rest] == [0, 1, 2]
 
 

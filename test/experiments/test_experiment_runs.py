@@ -140,7 +140,7 @@ def test_finished_frames_are_not_measured_again(few, tmp_path, monkeypatch):
     assert asked == [2, 3, 4]
     assert len(run_experiment(small(log_measure), recording, out, limit=1)) == 1
     assert asked == [2, 3, 4]
-    assert len(read_lines(tmp_path / "out")) == 1 + 4  # the plan, and what was not skipped
+    assert len(read_lines(tmp_path / "out")) == 1 + 4  # the plan, and frames that were not skipped
 
 
 def test_skipped_frame_is_tried_again(few, tmp_path):
@@ -150,12 +150,12 @@ def test_skipped_frame_is_tried_again(few, tmp_path):
     first = run_experiment(SMALL, open_recording(few), tmp_path / "out")
     assert "000001.bin" in first[1]["skipped"] and "000001.bin" in first[2]["skipped"]
     scan.write_bytes(whole)
-    resumed, anew = (run_experiment(SMALL, open_recording(few), tmp_path / name)
+    resumed, fresh = (run_experiment(SMALL, open_recording(few), tmp_path / name)
                      for name in ("out", "again"))
-    assert resumed == anew
+    assert resumed == fresh
 
 
-# What is in the way
+# Obstacles in the folder
 
 
 def test_other_settings_are_refused_by_name(few, tmp_path):

@@ -51,7 +51,7 @@ FACES = [name for name in CURVES if name.startswith("Car from")]  # no car there
 LIGHT = [name for name in CURVES if "intensity" in name]
 
 
-def recorded(seed: int, points: int = 500) -> Frame:
+def make_scan(seed: int, points: int = 500) -> Frame:
     """A street all around, and objects full of points."""
     rng = np.random.default_rng(seed)
     reach, turn = rng.uniform(3, 70, 12000), rng.uniform(-np.pi, np.pi, 12000)
@@ -78,31 +78,31 @@ def with_scan(frame: Frame, scan: PointCloud) -> Frame:
     return Frame.of(frame.name, scan, frame.truth(), frame.calibration())
 
 
-def rows_of(frame: Frame) -> dict:
+def compute_rows(frame: Frame) -> dict:
     """The rows of its objects."""
     return compute_object_rows(frame.load(), frame.truth(), frame.camera())
 
 
-def changed(change, count: int = SCANS) -> list[Frame]:
+def change_scans(change, count: int = SCANS) -> list[Frame]:
     """The street's scans with every frame changed."""
     return [with_scan(r, change(r.load(), np.random.default_rng(100 + i)))
-            for i, r in enumerate(map(recorded, range(count)))]
+            for i, r in enumerate(map(make_scan, range(count)))]
 
 
 @cache
 def street():
-    return measure_scans(map(recorded, range(SCANS)), PAPER)
+    return measure_scans(map(make_scan, range(SCANS)), PAPER)
 
 
-def judged(content: dict, names=CURVES) -> list[dict]:
+def list_judged_bins(content: dict, names=CURVES) -> list[dict]:
     return [b for name in names for b in content["curves"][name]["bins"]
             if b["within"] is not None]
 
 
 def test_recording_agrees_with_itself():
     content = compare_scans(street(), street())
-    assert content["within"] == content["judged"] == len(judged(content)) > 100
-    assert all(b["ratio"] == 1.0 and compute_factor(b) == 1.0 for b in judged(content))
+    assert content["within"] == content["judged"] == len(list_judged_bins(content)) > 100
+    assert all(b["ratio"] == 1.0 and compute_factor(b) == 1.0 for b in list_judged_bins(content))
     assert all(content["curves"][name]["judged"] for name in CURVES
                if "histogram" not in name and name not in FACES)
 
@@ -110,7 +110,7 @@ def test_recording_agrees_with_itself():
 def test_ground_is_found_below_a_low_sensor():
     up = np.array([0, 0, SENSOR_HEIGHT - 0.7], np.float32)
     lower = []
-    for frame in map(recorded, range(SCANS)):
+    for frame in map(make_scan, range(SCANS)):
         scan = frame.load()
         lower.append(Frame.of(frame.name, replace(scan, xyz=scan.xyz + up), sensor_height=0.7))
     measured = measure_scans(lower, PAPER)
@@ -121,18 +121,18 @@ def test_ground_is_found_below_a_low_sensor():
 def test_half_the_points_change_counts_and_not_sizes():
     def half(frame, rng):
         return frame.take(np.flatnonzero(rng.random(len(frame)) < 0.5))
-    content = compare_scans(street(), measure_scans(changed(half), PAPER))
+    content = compare_scans(street(), measure_scans(change_scans(half), PAPER))
     for name in COUNTS:
-        bins = [b for b in judged(content, [name]) if b["real"]["median"] >= 100]
+        bins = [b for b in list_judged_bins(content, [name]) if b["real"]["median"] >= 100]
         assert all(b["ratio"] == pytest.approx(0.5, abs=0.1) for b in bins), name
         assert content["curves"][name]["share"] < 0.5, name
-    assert all(b["within"] for b in judged(content, EXTENTS))
-    assert all(b["within"] for b in judged(content, LIGHT))
+    assert all(b["within"] for b in list_judged_bins(content, EXTENTS))
+    assert all(b["within"] for b in list_judged_bins(content, LIGHT))
 
 
 def test_half_the_intensity_changes_intensities_only():
     content = compare_scans(street(), measure_scans(
-        changed(lambda frame, rng: replace(frame, intensity=frame.intensity * 0.5)), PAPER))
+        change_scans(lambda frame, rng: replace(frame, intensity=frame.intensity * 0.5)), PAPER))
     for name, curve in content["curves"].items():
         if name not in LIGHT:
             assert all(b["ratio"] in (1.0, None) for b in curve["bins"]), name
@@ -142,26 +142,26 @@ def test_half_the_intensity_changes_intensities_only():
 
 def test_order_of_points_does_not_matter():
     content = compare_scans(street(), measure_scans(
-        changed(lambda frame, rng: frame.take(rng.permutation(len(frame)))), PAPER))
+        change_scans(lambda frame, rng: frame.take(rng.permutation(len(frame)))), PAPER))
     for name, curve in content["curves"].items():
         for b in curve["bins"]:
             assert b["real"] == b["simulated"], name
 
 
 def test_counts_add_up():
-    one = recorded(0)
+    one = make_scan(0)
     rows = {name: row[0] for name, row in compute_scan_rows(one.load()).items()}
     assert rows["points"].sum() == rows["scan points"][0] == len(one.load())
     assert ((rows["ground share"] >= 0) & (rows["ground share"] <= 1)
             | np.isnan(rows["ground share"])).all()
     assert (rows["person clusters"] <= rows["clusters"]).all()
     for name in LIGHT:
-        row = {**rows, **{k: v[0] for k, v in rows_of(one).items()}}[name]
+        row = {**rows, **{k: v[0] for k, v in compute_rows(one).items()}}[name]
         assert row.sum() == pytest.approx(1.0) if "histogram" in name else (np.diff(row) >= 0).all()
 
 
 def test_bins_with_few_real_samples_are_not_judged():
-    content = compare_scans(measure_scans(map(recorded, range(MIN_SAMPLES - 1)), PAPER), street())
+    content = compare_scans(measure_scans(map(make_scan, range(MIN_SAMPLES - 1)), PAPER), street())
     assert all(content["curves"][name]["judged"] == 0 for name in (*COUNTS, *EXTENTS))
     for name, curve in content["curves"].items():
         for b in curve["bins"]:
@@ -187,27 +187,27 @@ def test_empty_scans_are_not_judged():
 
 def test_scans_without_intensity_have_the_other_curves():
     bare = [Frame.of(r.name, replace(r.load(), intensity=None), r.truth())
-            for r in map(recorded, range(2))]
+            for r in map(make_scan, range(2))]
     measured = measure_scans(bare, replace(PAPER, view=replace(PAPER.view, enabled=False)))
     assert all((len(rows) == 0) == (name in LIGHT) for name, rows in measured.rows.items()
                if not name.startswith(("stage", "final")) and name not in FACES)
 
 
 def test_cropped_scan_counts_for_its_objects_only():
-    whole = recorded(0)
+    whole = make_scan(0)
     seen = np.flatnonzero(whole.camera().in_view(whole.load().xyz))
     cropped = with_scan(whole, whole.load().take(seen))
     assert is_whole(whole.load()) and not is_whole(cropped.load())
     measured = measure_scans([cropped], PAPER)
     assert (measured.scans, measured.whole_scans) == (1, 0)
     assert all(not measured.rows[name] for name in ("points", "clusters", "ground intensity"))
-    expected = rows_of(whole)
+    expected = compute_rows(whole)
     assert all(np.array_equal(rows, expected[name], equal_nan=True)
-               for name, rows in rows_of(cropped).items())
+               for name, rows in compute_rows(cropped).items())
 
 
 def test_objects_at_image_border_do_not_count():
-    one = recorded(0)
+    one = make_scan(0)
     border = one.truth().boxes[:1].copy()
     while one.camera().in_view(border[:, :3]).all():
         border[0, 1] += 0.1
@@ -217,11 +217,11 @@ def test_objects_at_image_border_do_not_count():
 
 @pytest.mark.parametrize("level", [1, 2, 3])
 def test_occluded_objects_count_for_all_points_only(level):
-    one = recorded(0)
+    one = make_scan(0)
     truth = one.truth()
     truth = replace(truth, extras=tuple({"occluded": level} for _ in truth.extras))
     found = set(compute_object_rows(one.load(), truth, one.camera()))
-    assert found == {name for name in rows_of(one)
+    assert found == {name for name in compute_rows(one)
                      if name.endswith("points of all") or "intensity" in name}
 
 
@@ -273,19 +273,19 @@ def test_median_interval_covers_the_median():
 
 
 def test_median_within_real_interval_is_plausible():
-    def thinned(shares):
+    def thin(shares):
         return measure_scans([with_scan(r, r.load().take(np.flatnonzero(
             np.random.default_rng(100).random(len(r.load())) < share)))
-            for r, share in zip(map(recorded, range(SCANS)), shares)], PAPER)
-    content = compare_scans(thinned(np.linspace(0.3, 1, SCANS)), thinned([0.9] * SCANS))
-    points = judged(content, ["scan points", "Car points"])
+            for r, share in zip(map(make_scan, range(SCANS)), shares)], PAPER)
+    content = compare_scans(thin(np.linspace(0.3, 1, SCANS)), thin([0.9] * SCANS))
+    points = list_judged_bins(content, ["scan points", "Car points"])
     assert not any(b["within"] for b in points) and all(b["plausible"] for b in points)
     assert content["within"] < content["plausible"] <= content["judged"]
-    assert all(b["plausible"] for b in judged(content) if b["within"])
+    assert all(b["plausible"] for b in list_judged_bins(content) if b["within"])
 
 
 def test_content_survives_json_and_is_printed(tmp_path):
-    content = compare_scans(street(), measure_scans(map(recorded, range(3)), PAPER))
+    content = compare_scans(street(), measure_scans(map(make_scan, range(3)), PAPER))
     again = json.loads(json.dumps(content, allow_nan=False))
     assert again == content
     shown = StringIO()

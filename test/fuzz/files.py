@@ -61,7 +61,7 @@ INSTEAD: dict[str, Callable[[Path], object]] = {
 def samples() -> dict[str, bytes]:
     """Return the bytes of every valid file by its path."""
     with tempfile.TemporaryDirectory() as folder:
-        # In a process of its own: threads that torch starts here would be missing in forked ones.
+        # In another process, because threads that torch starts here would be missing in forks.
         subprocess.run([sys.executable, "-m", "fuzz.sample_files", folder], check=True)
         return {path.relative_to(folder).as_posix(): path.read_bytes()
                 for path in sorted(Path(folder).rglob("*")) if path.is_file()}

@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from footprint_samples import find_overlaps, make_flat_boxes
 from samples import header
-from test_street import flat_boxes, overlaps
 
 from lidar_perception.cli.simulate import simulate
 from lidar_perception.data.open import open_recording
@@ -34,10 +34,10 @@ TINY = make_generic_sensor(16, -15.0, 15.0, 2.0, 10.0, height=0.6)
 EXACT = replace(TINY, range_noise=0.0, dropout=0.0, divergence=0.0)
 PEOPLE = {CLASSES.index(name) for name in ("Pedestrian", "Person_sitting", "Cyclist")}
 SITTING, GROUND = CLASSES.index("Person_sitting"), (40, 44, 48, 72)
-scene_of = cache(lambda scene, kind, seed=2: make_scene(seed, kind, 2.0, scene))
+make_cached_scene = cache(lambda scene, kind, seed=2: make_scene(seed, kind, 2.0, scene))
 
 
-def moved(xyz, pose):
+def transform_points(xyz, pose):
     return xyz @ pose[:3, :3].T + pose[:3, 3]
 
 
@@ -71,18 +71,18 @@ def test_trajectory_derivatives_are_exact():
 
 @pytest.mark.parametrize("scene, kind", ROBOTS)
 def test_actors_never_touch_robot_or_each_other(scene, kind):
-    made = scene_of(scene, kind)
+    made = make_cached_scene(scene, kind)
     props = [a for a in made.actors if not a.thing.label]
-    fixed = flat_boxes(np.array([a.footprint for a in props]), 0.0)
+    fixed = make_flat_boxes(np.array([a.footprint for a in props]), 0.0)
     for t in np.linspace(0.0, made.seconds, 9):
         moment, pose = made.at(t, 0.6), made.sensor_pose(t, 0.6)
         robot = np.array([[0.0, 0, 0, 1.4 * ROBOT_RADIUS_M, 1.4 * ROBOT_RADIUS_M, 1, 0]])
         boxes = np.concatenate([robot, moment.boxes * [1, 1, 0, 1, 1, 1, 1]])
-        assert not {0} & set(overlaps(boxes, 1)[:, 0].tolist())
-        for i, j in overlaps(boxes, len(boxes)):
+        assert not {0} & set(find_overlaps(boxes, 1)[:, 0].tolist())
+        for i, j in find_overlaps(boxes, len(boxes)):
             assert {moment.class_ids[i - 1], moment.class_ids[j - 1]} == {SITTING}
         there = fixed - [*pose[:2, 3], 0, 0, 0, 0, 0]
-        assert not len(overlaps(np.concatenate([robot, there]), 1))
+        assert not len(find_overlaps(np.concatenate([robot, there]), 1))
     assert any(a.thing.label in ("Pedestrian", "Person_sitting") for a in made.actors)
 
 
@@ -90,21 +90,21 @@ def test_actors_never_touch_robot_or_each_other(scene, kind):
 def test_points_and_boxes_agree_with_world(scene, kind):
     """At any heading and yaw rate the ground agrees with the world, and points of labelled objects
     are in their boxes."""
-    made = scene_of(scene, kind)
+    made = make_cached_scene(scene, kind)
     made = replace(made, ground=made.ground._replace(rough=0.0, litter=0.0))
     for t in (0.0, 7.3):
         moment, pose = made.at(t, 0.6), made.sensor_pose(t, 0.6)
         hits = cast_rays(moment.solids, made.ground, moment.position, EXACT, moment.motion, 1,
                          moment.heading)
         got = make_returns(hits, EXACT, moment.motion, np.random.default_rng(0))
-        world = moved(got.xyz.astype(float), pose)
+        world = transform_points(got.xyz.astype(float), pose)
         ground = np.isin(got.semantic, GROUND) & (got.owner == 0)
         off = world[ground, 2] - surface_height(made.ground, *world[ground, :2].T)
         # On the edge of a kerb, height is that of either side.
         assert ground.sum() > 100 and (np.abs(off) < 2e-3).mean() > 0.97
         assert np.abs(off).max() <= made.ground.curb_height + 2e-3
         boxes = moment.boxes.copy()
-        boxes[:, :3] = moved(boxes[:, :3], pose)
+        boxes[:, :3] = transform_points(boxes[:, :3], pose)
         feet = surface_height(made.ground, *boxes[:, :2].T)
         assert np.allclose(boxes[:, 2] - boxes[:, 5] / 2, feet)
         for box, track, speed in zip(moment.boxes, moment.track_ids, moment.speeds):
@@ -114,9 +114,9 @@ def test_points_and_boxes_agree_with_world(scene, kind):
 
 
 def test_turned_sensor_has_same_hits():
-    """Of two robots in one place, one is turned by twenty firings. Rays in the same direction have
+    """Two robots in one place differ by twenty firings in heading. Rays in the same direction have
     the same hits, except through glass."""
-    made, ranges, turn = scene_of("indoor", "store"), [], 20 * 2 * np.pi / EXACT.columns
+    made, ranges, turn = make_cached_scene("indoor", "store"), [], 20 * 2 * np.pi / EXACT.columns
     for aside in (0.0, np.tan(turn)):
         one = replace(made, way=Trajectory(1e-9, ((1e-9 * aside, 1.0, 0.0),)))
         moment = one.at(0.0, 0.6)
@@ -140,7 +140,7 @@ def test_robots_have_labels_all_around_and_no_camera(tmp_path):
 
 def test_mixed_scenes_alternate():
     mixed = Scenes(None, 1.0, "street,indoor")
-    assert scene_of("indoor", None, 3).kind == make_scene(3, None, 2.0, mixed.scene).kind
+    assert make_cached_scene("indoor", None, 3).kind == make_scene(3, None, 2.0, mixed.scene).kind
     assert make_scene(4, None, 1.0, mixed.scene).kind == make_scene(4).kind
     source = SimulatedScenes(3, 2, TINY, mixed)
     assert not mixed.camera and source.frame(0).camera() is None

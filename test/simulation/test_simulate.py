@@ -74,19 +74,19 @@ def test_failed_data_set_is_marked_and_resumed(made, tmp_path, monkeypatch,
 
 @pytest.fixture
 def start():
-    """start(out, frames, ...) runs the command in its own process group until some frames are done.
+    """Return start(out, frames, ...), which runs the command until some frames are done.
 
     The group ends with the test.
     """
     groups = []
 
-    def begun(out, frames, *more):
+    def begin(out, frames, *more):
         process = subprocess.Popen(
             [sys.executable, "-c", SCRIPT, "simulate",
              *arguments(out, "kitti-tracking", frames, 2, *more)],
             cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, start_new_session=True,
             text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            # A shell lets what it starts in the background ignore SIGINT.
+            # Background processes of a shell ignore SIGINT.
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
         groups.append(process.pid)
         while len(list(out.glob(".parts/*.json"))) < 3:
@@ -94,7 +94,7 @@ def start():
             time.sleep(0.01)
         return process
 
-    yield begun
+    yield begin
     for group in groups:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(group, signal.SIGKILL)
@@ -184,7 +184,7 @@ def test_existing_files_are_not_touched_without_option(made, tmp_path):
         run(out, "kitti", 2, 1, "--force")
     assert content(out) == before | {"notes.txt": b"dear"}
     notes.unlink()
-    (out / resumable_folder.RECORD_NAME).unlink()  # stopped while --force removed what was there
+    (out / resumable_folder.RECORD_NAME).unlink()  # as an interrupted --force leaves it
     (out / resumable_folder.INCOMPLETE_NAME).write_text("{}")
     with pytest.raises(InputError, match="start again with --force"):
         run(out, "kitti", 2, 1, "--resume")

@@ -66,7 +66,7 @@ def test_object_layout_reads_back(made):
         assert np.array_equal(frame.intensity, scan.frame.intensity[order])
         assert np.allclose(camera.projection, FORWARD_CAMERA.camera().projection)
         assert (camera.width, camera.height) == (1242, 375)
-        same_objects(recorded.truth(), make_kitti_labels(scan.truth), 0.0051)
+        assert_same_objects(recorded.truth(), make_kitti_labels(scan.truth), 0.0051)
 
 
 def test_hidden_objects_become_dont_care():
@@ -89,12 +89,12 @@ def test_tracking_layout_reads_back(made):
         scan = simulate_scan(3 + number // 2, number % 2, TINY)
         expected = make_kitti_labels(scan.truth)
         truth = recorded.truth()
-        same_objects(truth, expected, 6e-7, truncation=0.26)
+        assert_same_objects(truth, expected, 6e-7, truncation=0.26)
         assert ([e["track_id"] for e in truth.extras]
                 == [e["track_id"] for e in expected.extras])
 
 
-def same_objects(found, expected, accuracy, truncation=None):
+def assert_same_objects(found, expected, accuracy, truncation=None):
     """Assert that labels agree to the digits of the text."""
     assert found.labels == expected.labels
     assert [name for name, _ in found.notes] == [name for name, _ in expected.notes]

@@ -5,16 +5,10 @@ from functools import cache
 
 import numpy as np
 import pytest
+from footprint_samples import find_overlaps, make_flat_boxes
 
 from lidar_perception.geometry import box_corners
-from lidar_perception.simulation.actors import (
-    HEADING,
-    LENGTH,
-    SPEED,
-    WIDTH,
-    compute_centres,
-    footprints_touch,
-)
+from lidar_perception.simulation.actors import SPEED, WIDTH, footprints_touch
 from lidar_perception.simulation.roadside import is_plant
 from lidar_perception.simulation.scene import make_scene
 from lidar_perception.simulation.street import STREET_KINDS
@@ -30,35 +24,10 @@ TIMES = (0.0, 4.0, 8.0, 12.0, 16.0)
 HEIGHT = 1.73
 SITTING, CAR, PEDESTRIAN, CYCLIST = (
     CLASSES.index(name) for name in ("Person_sitting", "Car", "Pedestrian", "Cyclist"))
-scene_of = cache(lambda kind, seed, people=1.0: make_scene(seed, kind, people))
+make_cached_scene = cache(lambda kind, seed, people=1.0: make_scene(seed, kind, people))
 
 
-def flat_boxes(footprints, t):
-    """Return boxes (M, 7) [x y 0 l w 1 heading] of footprints (M, 8) at time t, in the world."""
-    middle = compute_centres(footprints, np.array([t]))[:, 0]
-    one, zero = np.ones(len(middle)), np.zeros(len(middle))
-    return np.column_stack([middle, zero, 2 * footprints[:, LENGTH:WIDTH + 1], one,
-                            footprints[:, HEADING]])
-
-
-def overlaps(boxes, many):
-    """Return pairs (n, 2) of one of the first `many` boxes (M, 7) and a later one that overlap."""
-    corner = box_corners(boxes)[:, :4, :2]
-    first, second = np.nonzero(np.arange(many)[:, None] < np.arange(len(boxes)))
-    reach = np.hypot(boxes[:, 3], boxes[:, 4]) / 2
-    close = np.hypot(*(boxes[first, :2] - boxes[second, :2]).T) < reach[first] + reach[second]
-    first, second = first[close], second[close]
-    apart = np.zeros(len(first), bool)
-    for whose in (first, second):
-        for turn in (0.0, np.pi / 2):
-            angle = boxes[whose, 6] + turn
-            normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-            a, b = (np.einsum("mcd,md->mc", corner[i], normal) for i in (first, second))
-            apart |= (a.min(1) > b.max(1) - 1e-3) | (b.min(1) > a.max(1) - 1e-3)
-    return np.column_stack([first, second])[~apart]
-
-
-def content(scene):
+def list_content(scene):
     moments = [scene.at(t, HEIGHT) for t in (0.0, 7.3)]
     return [scene.ground, scene.way.speed] + [
         array.tobytes() for m in moments
@@ -68,32 +37,32 @@ def content(scene):
 
 def test_same_seed_same_street():
     drawn = make_scene(3)
-    first = content(drawn)
-    assert first == content(make_scene(3, drawn.kind))
-    assert all(a != b for a, b in zip(first, content(scene_of(drawn.kind, 0))))
+    first = list_content(drawn)
+    assert first == list_content(make_scene(3, drawn.kind))
+    assert all(a != b for a, b in zip(first, list_content(make_cached_scene(drawn.kind, 0))))
 
 
 @pytest.mark.parametrize("kind, seed", EVERY)
 def test_nothing_ever_overlaps(kind, seed):
     """Labelled and unlabelled things and the ego vehicle, except people on benches and plants."""
-    scene = scene_of(kind, seed)
+    scene = make_cached_scene(kind, seed)
     props = [a for a in scene.actors if not a.thing.label]
     plants = np.array([is_plant(a) for a in props])
-    fixed = flat_boxes(np.array([a.footprint for a in props]), 0.0)
-    assert not len(overlaps(fixed[~plants], sum(~plants)))
+    fixed = make_flat_boxes(np.array([a.footprint for a in props]), 0.0)
+    assert not len(find_overlaps(fixed[~plants], sum(~plants)))
     for t in np.linspace(0.0, scene.seconds, 5):
         moment = scene.at(t, HEIGHT)
         ego = np.array([[0.0, 0, 0, 4.6, 1.9, 1, 0]])
         there = fixed - [*moment.position[:2], 0, 0, 0, 0, 0]
         boxes = np.concatenate([ego, moment.boxes * [1, 1, 0, 1, 1, 1, 1], there])
-        for i, j in overlaps(boxes, len(moment.boxes) + 1):
+        for i, j in find_overlaps(boxes, len(moment.boxes) + 1):
             sits = i > 0 and moment.class_ids[i - 1] == SITTING
             assert sits and j > len(moment.boxes), (t, boxes[i], boxes[j])
 
 
 @pytest.mark.parametrize("kind, seed", EVERY)
 def test_everything_is_on_ground(kind, seed):
-    scene = scene_of(kind, seed)
+    scene = make_cached_scene(kind, seed)
     m = scene.at(5.0, HEIGHT)
     world = m.boxes[:, :3] + m.position
     ground = surface_height(scene.ground, *world[:, :2].T)
@@ -107,14 +76,14 @@ def test_everything_is_on_ground(kind, seed):
         if len(m.solids):
             foot = (m.solids.centre[:, 2] - np.abs(m.solids.axes[:, 2] * m.solids.half).sum(axis=1)
                     ).min() + m.position[2]
-            box = flat_boxes(actor.footprint[None], 0.0)
+            box = make_flat_boxes(actor.footprint[None], 0.0)
             under = surface_height(scene.ground, *box_corners(box)[0, :4, :2].T)
             assert under.min() - 1.5 < foot < under.min() + 0.12
 
 
 @pytest.mark.parametrize("kind, seed", EVERY)
 def test_boxes_move_with_their_speed(kind, seed):
-    scene, dt = scene_of(kind, seed), 0.5
+    scene, dt = make_cached_scene(kind, seed), 0.5
     for t in (0.0, 9.0):
         one, two = scene.at(t, HEIGHT), scene.at(t + dt, HEIGHT)
         for m in (one, two):
@@ -136,7 +105,7 @@ def test_boxes_move_with_their_speed(kind, seed):
 
 @pytest.mark.parametrize("kind, seed", EVERY)
 def test_no_vehicle_is_close_to_ego_vehicle(kind, seed):
-    scene = scene_of(kind, seed)
+    scene = make_cached_scene(kind, seed)
     for t in (0.0, 10.0, 20.0):
         m = scene.at(t, HEIGHT)
         lane = ((np.abs(m.boxes[:, 1]) < 1.0) & (np.abs(m.boxes[:, 6]) < 0.1)
@@ -147,7 +116,7 @@ def test_no_vehicle_is_close_to_ego_vehicle(kind, seed):
 
 def test_solids_have_velocity_and_class_of_owner():
     for kind in STREET_KINDS:
-        m = scene_of(kind, 0).at(3.0, HEIGHT)
+        m = make_cached_scene(kind, 0).at(3.0, HEIGHT)
         speed = dict(zip(m.track_ids, m.speeds))
         flat = np.hypot(*m.solids.velocity[:, :2].T)
         assert np.allclose(flat, [speed.get(o, 0.0) for o in m.solids.owner])
@@ -159,7 +128,7 @@ def test_solids_have_velocity_and_class_of_owner():
 def test_islands_are_at_crossings_and_off_lanes():
     found = 0
     for kind, seed in EVERY:
-        scene = scene_of(kind, seed)
+        scene = make_cached_scene(kind, seed)
         middle = [a for a in scene.actors if not a.thing.label and a.speed == 0.0
                   and 1.3 < a.y < 2.8 and (a.thing.parts(0.0)["semantic"] == SIGN).any()]
         edges = np.ravel(scene.ground.crossings)
@@ -171,16 +140,16 @@ def test_islands_are_at_crossings_and_off_lanes():
 
 
 def test_streets_have_objects_that_kitti_labels():
-    """In the forward camera's view and within 30 m, the 57 labelled frames beside the checkout
-    have 1.7 cars, 0.19 pedestrians and 0.14 cyclists, fewer than stand there: what is hidden has
-    no label. They are few (11 pedestrians, 8 cyclists), so the bands are wide."""
+    """The 57 labelled KITTI frames have 1.7 cars, 0.19 pedestrians and 0.14 cyclists within 30 m in
+    the camera's view. Hidden objects have no label. The numbers are small (11 pedestrians and 8
+    cyclists), so the bands are wide."""
     seeds = range(4)  # cyclists are rare
     share = np.array([k.share for k in STREET_KINDS.values()])
     found = np.zeros((len(STREET_KINDS), len(CLASSES)))
     for i, kind in enumerate(STREET_KINDS):
         for seed in seeds:
             for t in TIMES:
-                m = scene_of(kind, seed).at(t, HEIGHT)
+                m = make_cached_scene(kind, seed).at(t, HEIGHT)
                 seen = ((np.abs(np.arctan2(m.boxes[:, 1], m.boxes[:, 0])) < np.radians(40))
                         & (np.hypot(*m.boxes[:, :2].T) < 30))
                 found[i] += np.bincount(m.class_ids[seen], minlength=len(CLASSES))
@@ -194,13 +163,13 @@ def test_streets_have_objects_that_kitti_labels():
 
 def test_people_option_scales_number_of_people():
     def people(factor):
-        labels = [a.thing.label for a in scene_of("residential", 0, factor).actors]
+        labels = [a.thing.label for a in make_cached_scene("residential", 0, factor).actors]
         return sum(label in ("Pedestrian", "Person_sitting", "Cyclist") for label in labels)
     assert people(0.0) == 0 < people(1.0) < people(4.0) / 2
 
 
 def test_moment_without_objects_has_empty_arrays():
-    scene = replace(scene_of("country", 0), actors=())
+    scene = replace(make_cached_scene("country", 0), actors=())
     m = scene.at(0.0, HEIGHT)
     assert len(m.solids) == 0 and m.solids.axes.shape == (0, 3, 3)
     assert m.boxes.shape == (0, 7) and m.boxes.dtype == np.float64
@@ -226,9 +195,9 @@ def test_footprints_touch_equals_dense_sampling():
     fast = np.array([footprints_touch(one, row, 5.0, 0.0) for row in many])
     slow = np.zeros(len(many), bool)
     for t in np.linspace(0.0, 5.0, 501):
-        boxes = flat_boxes(rows, t)
-        boxes[0] = flat_boxes(one[None], t)[0]
-        slow[[j - 1 for i, j in overlaps(boxes, 1)]] = True
+        boxes = make_flat_boxes(rows, t)
+        boxes[0] = make_flat_boxes(one[None], t)[0]
+        slow[[j - 1 for i, j in find_overlaps(boxes, 1)]] = True
     assert 20 < fast.sum() < 100
     assert (fast >= slow).all() and (fast != slow).sum() <= 2  # touched for less than an interval
     assert np.array_equal(fast, [footprints_touch(row, one, 5.0, 0.0) for row in many])

@@ -31,7 +31,7 @@ def test_flat_ground_range_is_height_over_sine():
     assert (hits.owner == 0).all() and (hits.solid == -1).all()
 
 
-def on_ground(ground, position=(3.0, 0.4), sensor=None):
+def cast_on_ground(ground, position=(3.0, 0.4), sensor=None):
     sensor = sensor or replace(SENSOR, azimuth_step=np.radians(0.5))
     position = np.array([*position, surface_height(ground, *position) + sensor.height])
     hits = cast_rays(crowd(0, 0), ground, position, sensor)
@@ -45,7 +45,7 @@ def on_ground(ground, position=(3.0, 0.4), sensor=None):
     FULL, FULL._replace(crossings=()), FULL._replace(wave=0.0, camber=0.05),
     Ground(0.02, -0.03, 0.1)])
 def test_hit_is_on_surface_of_ground(ground):
-    at, semantic, met, _ = on_ground(ground)
+    at, semantic, met, _ = cast_on_ground(ground)
     x, y, z = at.T
     off = z - surface_height(ground, x, y)
     edges = [np.abs(y - ground.curb_left), np.abs(y - ground.curb_right)]
@@ -59,7 +59,7 @@ def test_hit_is_on_surface_of_ground(ground):
 
 
 def test_no_ray_passes_through_ground():
-    _, _, met, hits = on_ground(FULL)
+    _, _, met, hits = cast_on_ground(FULL)
     sensor = replace(SENSOR, azimuth_step=np.radians(0.5))
     turn, start = make_rays(sensor), np.array([3.0, 0.4, surface_height(FULL, 3.0, 0.4) + 1.7])
     for share in np.linspace(0.02, 0.995, 40):
@@ -69,7 +69,7 @@ def test_no_ray_passes_through_ground():
 
 
 def test_ground_classes_are_in_place():
-    at, semantic, _, _ = on_ground(FULL, sensor=replace(SENSOR, azimuth_step=np.radians(0.25)))
+    at, semantic, _, _ = cast_on_ground(FULL, sensor=replace(SENSOR, azimuth_step=np.radians(0.25)))
     x, y, _ = at.T
     crossing = ((x > 8) & (x < 15)) | ((x > -30) & (x < -22))
     out = np.maximum(y - 6, -4 - y)
@@ -83,7 +83,7 @@ def test_ground_classes_are_in_place():
 
 def test_rough_ground_is_bounded_and_constant():
     rough = FULL._replace(rough=0.08, litter=0.04)
-    (at, semantic, _, _), (again, *_) = on_ground(rough), on_ground(rough)
+    (at, semantic, _, _), (again, *_) = cast_on_ground(rough), cast_on_ground(rough)
     assert np.array_equal(at, again)
     off = at[:, 2] - surface_height(rough, at[:, 0], at[:, 1])
     for chosen, most in ((semantic == 72, 0.08), (semantic == 40, 0.008), (semantic == 44, 0.04)):
@@ -91,23 +91,23 @@ def test_rough_ground_is_bounded_and_constant():
         assert off[near].min() > -0.01 and np.quantile(off[near], 0.99) < 1.3 * most
         assert off[near].std() > 0.1 * most
     # The same bumps from elsewhere.
-    assert np.isfinite(on_ground(rough, (4.0, 0.4))[0]).all()
+    assert np.isfinite(cast_on_ground(rough, (4.0, 0.4))[0]).all()
 
 
 def test_grass_is_rough_and_hides_ground_behind():
     meadow = Ground(curb_left=2.0, curb_right=-2.0, walk=0.0, rough=0.6)
-    at, _, met, hits = on_ground(meadow, sensor=HDL64E)
+    at, _, met, hits = cast_on_ground(meadow, sensor=HDL64E)
     above = at[:, 2] - surface_height(meadow, at[:, 0], at[:, 1])
     assert -0.01 < above.min() and above.max() < 0.6
     wild = np.abs(at[:, 1]) > 8  # no tuft of the road's side reaches there
     near, middle, far = compute_roughness(at[wild], np.array([8.0, 12.0, 18.0, 30.0]))
     assert 0.02 < min(near, middle, far) and max(near, middle, far) < 0.1
-    _, _, _, smooth = on_ground(meadow._replace(rough=0.0), sensor=HDL64E)
+    _, _, _, smooth = cast_on_ground(meadow._replace(rough=0.0), sensor=HDL64E)
     assert (hits.range[met] <= smooth.range[met] + 1e-9).all()
 
 
 @njit
-def first_below_tufts(ground, start, way):
+def march_to_tufts(ground, start, way):
     """Return the first range, in steps of 5 mm, at which a ray is below the tufts."""
     t = 0.0
     while t < 30.0 and start[2] + t * way[2] >= tuft_height(ground, start[0] + t * way[0],
@@ -123,7 +123,7 @@ def test_tuft_hits_equal_slow_march():
     ways = np.stack([np.cos(yaw) * np.cos(down), np.sin(yaw) * np.cos(down), -np.sin(down)], 1)
     ground, start = to_compiled(meadow), (0.0, 0.0, 1.7)
     off = np.abs([cast_ground(ground, start, tuple(way), 60.0).range
-                  - first_below_tufts(ground, start, tuple(way)) for way in ways.tolist()])
+                  - march_to_tufts(ground, start, tuple(way)) for way in ways.tolist()])
     # Steps are longer than tufts are thick: some are missed, and few met too early.
     assert np.quantile(off, 0.5) < 0.1 and np.quantile(off, 0.9) < 0.5
 

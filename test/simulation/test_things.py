@@ -49,18 +49,18 @@ SCENERY = {
 SEMANTICS = {10, 11, 15, 16, 18, 20, 30, 31, 50, 51, 70, 71, 80, 81, 99}
 
 
-def made_by(make, seed):
+def make_parts(make, seed):
     """Return the parts of a thing, labelled or not."""
     thing = make(np.random.default_rng(seed))
     return thing.parts(0.7) if hasattr(thing, "parts") else thing
 
 
-def hull(made):
+def find_extents(made):
     low, high = compute_extents(made)
     return low.min(axis=0), high.max(axis=0)
 
 
-def stride(thing):
+def find_stride(thing):
     return 2 * thing.parts.keywords["build"].step
 
 
@@ -68,7 +68,7 @@ def stride(thing):
 def test_parts_are_valid(name):
     make, most = {**LABELLED, **SCENERY}[name]
     for seed in SEEDS:
-        made = made_by(make, seed)
+        made = make_parts(make, seed)
         assert 0 < len(made) <= most
         assert np.isin(made["kind"], (0, 1, 2)).all()
         assert set(made["semantic"].tolist()) <= SEMANTICS
@@ -82,8 +82,8 @@ def test_parts_are_valid(name):
 @pytest.mark.parametrize("name", [*LABELLED, *SCENERY])
 def test_same_seed_gives_same_thing(name):
     make, _ = {**LABELLED, **SCENERY}[name]
-    assert made_by(make, 5).tobytes() == made_by(make, 5).tobytes()
-    assert made_by(make, 5).tobytes() != made_by(make, 6).tobytes()
+    assert make_parts(make, 5).tobytes() == make_parts(make, 5).tobytes()
+    assert make_parts(make, 5).tobytes() != make_parts(make, 6).tobytes()
 
 
 @pytest.mark.parametrize("name", LABELLED)
@@ -109,7 +109,7 @@ def test_box_of_pedestrian_holds_for_whole_stride(name):
     make, _ = LABELLED[name]
     for seed in SEEDS:
         thing = make(np.random.default_rng(seed))
-        hulls = [hull(thing.parts(x)) for x in np.linspace(0, stride(thing), 101)]
+        hulls = [find_extents(thing.parts(x)) for x in np.linspace(0, find_stride(thing), 101)]
         low, high = np.array(hulls).transpose(1, 0, 2)
         assert np.abs(low[:, 2]).max() < 1e-9  # a foot is always on the ground
         assert high[:, 2].max() <= thing.size[2] + 0.002
@@ -123,7 +123,7 @@ def test_box_of_pedestrian_holds_for_whole_stride(name):
 def test_foot_on_ground_does_not_slide():
     for seed in SEEDS:
         thing = people.make_pedestrian(np.random.default_rng(seed), 1.3)
-        ways = np.linspace(0, stride(thing), 401)
+        ways = np.linspace(0, find_stride(thing), 401)
         feet = np.array([thing.parts(x)[-2:] for x in ways])
         tip = feet["centre"][..., 0] + feet["half"][..., 0] * np.cos(feet["pitch"]) + (
             ways[:, None] - feet["half"][..., 2] * np.sin(feet["pitch"]))
@@ -136,10 +136,10 @@ def test_foot_on_ground_does_not_slide():
 
 def test_walk_repeats_after_stride_and_mirrors_after_step():
     thing = people.make_pedestrian(np.random.default_rng(3), 1.4)
-    now, later = thing.parts(0.2), thing.parts(0.2 + stride(thing))
+    now, later = thing.parts(0.2), thing.parts(0.2 + find_stride(thing))
     assert np.allclose(now["centre"], later["centre"])
     low, high = compute_extents(now)
-    low_step, _ = compute_extents(thing.parts(0.2 + stride(thing) / 2))
+    low_step, _ = compute_extents(thing.parts(0.2 + find_stride(thing) / 2))
     assert np.allclose(np.sort(low[:, 0]), np.sort(low_step[:, 0]))
     assert np.allclose(np.sort(high[:, 1]), np.sort(-low_step[:, 1]))
 
@@ -148,7 +148,7 @@ def test_limbs_are_connected_and_keep_length():
     """Limbs keep their length between joints; knees bend forward."""
     thing = people.make_pedestrian(np.random.default_rng(4), 1.4)
     height = thing.size[2]
-    for x in np.linspace(0, stride(thing), 50):
+    for x in np.linspace(0, find_stride(thing), 50):
         thigh, shank = (thing.parts(x)[[-6, -5]], thing.parts(x)[[-4, -3]])
         for row in (*thigh, *shank):
             assert 0.24 * height < 2 * row["half"][2] < 0.25 * height
@@ -166,7 +166,7 @@ def test_load_does_not_change_width_or_height_of_box(carried):
     loaded = people.make_pedestrian(np.random.default_rng(2), 1.2, carried=carried)
     assert len(loaded.parts(0.0)) > len(plain.parts(0.0))
     assert loaded.size[1:] == plain.size[1:]
-    low, _ = hull(loaded.parts(0.3))
+    low, _ = find_extents(loaded.parts(0.3))
     assert abs(low[2]) < 1e-9
 
 
@@ -176,7 +176,7 @@ def test_wheels_stay_on_road_while_pedals_turn():
         poses = [thing.parts(x) for x in np.linspace(0, 5, 41)]
         for made in poses:
             assert np.allclose(compute_extents(made[:2])[0][:, 2], 0.0, atol=1e-9)
-            low, high = hull(made)
+            low, high = find_extents(made)
             assert np.allclose(high - low, thing.size, atol=1e-6)
         assert not np.array_equal(poses[0]["centre"], poses[4]["centre"])
 
@@ -200,7 +200,7 @@ def test_beam_can_pass_through_windows_of_car():
     assert (made["transmission"][met] > 0.5).all() and met.sum() == 2
 
 
-def points_of(thing, distance, yaw, seed):
+def scan_thing(thing, distance, yaw, seed):
     """Return the xyz that the HDL-64E sees of a thing at a distance ahead; z above its bottom."""
     made = thing.parts(0.4 * seed)
     base = np.tile([distance, 0.0, -1.73], (len(made), 1))
@@ -212,11 +212,11 @@ def points_of(thing, distance, yaw, seed):
 
 
 def test_low_share_of_cyclist_agrees_with_kitti():
-    """Of 10 cyclists of KITTI 46 % of the points are below 0.42 of the height."""
+    """46 % of the points of 10 KITTI cyclists are below 0.42 of their height."""
     shares = []
     for seed in SEEDS:
         thing = cyclists.make_cyclist(np.random.default_rng(seed))
-        heights = points_of(thing, 20.0, 0.5 * seed, seed)[:, 2]
+        heights = scan_thing(thing, 20.0, 0.5 * seed, seed)[:, 2]
         shares.append((heights[heights > 0.15] < 0.42 * thing.size[2]).mean())
     assert 0.40 < np.mean(shares) < 0.52
 
@@ -229,17 +229,17 @@ def test_share_above_belt_of_car_falls_with_range(distance, low, high):
     shares = []
     for seed in range(16):
         thing = vehicles.make_car(np.random.default_rng(seed))
-        heights = points_of(thing, distance, 0.0, seed)[:, 2] / thing.size[2]
+        heights = scan_thing(thing, distance, 0.0, seed)[:, 2] / thing.size[2]
         if (heights > 0.15).sum() >= 8:
             shares.append((heights[heights > 0.15] > 0.65).mean())
     assert low < np.mean(shares) < high
 
 
 @cache
-def cars_from_the_front():
+def scan_cars_from_front():
     """Return 24 cars and their points from 20 m away."""
     cars = [vehicles.make_car(np.random.default_rng(seed)) for seed in range(24)]
-    return [(car, points_of(car, 20.0, np.pi + 0.05 * (seed % 5 - 2), seed))
+    return [(car, scan_thing(car, 20.0, np.pi + 0.05 * (seed % 5 - 2), seed))
             for seed, car in enumerate(cars)]
 
 
@@ -249,7 +249,7 @@ def test_only_bumper_reaches_front_of_box(zone, low, high):
     """A quarter of the points of a zone of heights are within 0.07, 0.17 and 0.60 m of the end of
     the box: medians of 42 to 59 cars of KITTI seen from the front."""
     depths = []
-    for thing, points in cars_from_the_front():
+    for thing, points in scan_cars_from_front():
         x, y, z = points.T
         met = (np.abs(y) < 0.45 * thing.size[1]) & (z > zone[0] * thing.size[2]) & (
             z < zone[1] * thing.size[2]) & (x < 21.0)
@@ -298,7 +298,7 @@ def test_size_table_agrees_with_labels(data):
 def test_scenery_is_on_or_in_ground(name):
     make, _ = SCENERY[name]
     for seed in SEEDS:
-        low, high = hull(made_by(make, seed))
+        low, high = find_extents(make_parts(make, seed))
         assert low[2] <= 1e-9 < high[2]
 
 

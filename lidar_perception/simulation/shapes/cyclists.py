@@ -108,7 +108,7 @@ def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
 
 
 def _bicycle_parts(length: float, half_bar: float, bar: tuple, frame: float) -> list[tuple]:
-    """Return wheels, tubes, handlebar at bar (x, z), and what is between and above the wheels.
+    """Return wheels, tubes, handlebar at bar (x, z), and the parts between and above the wheels.
 
     Parts are as thick as wide beams see them: 46 % of the points of KITTI's cyclists are lower than
     0.42 of their height, 22 % also more than 0.35 m from the centre (10 cyclists up to 40 m).
