@@ -46,13 +46,13 @@ def as_it_comes() -> Callable[[np.ndarray], np.ndarray]:
     return pose
 
 
-def recorded(data: Path, frames: int) -> Scans:
+def read_scans(data: Path, frames: int) -> Scans:
     """The first frames of a recording."""
     for frame in islice(open_recording(data), frames):
         yield frame.sequence, frame.load(), None
 
 
-def simulated(streets: int, frames: int) -> Scans:
+def simulate_scans(streets: int, frames: int) -> Scans:
     """The first frames of so many streets."""
     for street in range(FIRST_STREET, FIRST_STREET + streets):
         for scan in simulate_drive(street, frames):
@@ -103,7 +103,7 @@ def _off(poses: np.ndarray, true: np.ndarray, step: int) -> np.ndarray:
 @click.option("--frames", type=click.IntRange(2), default=30, show_default=True)
 def main(data: Path | None, streets: int, frames: int) -> None:
     """What KISS-ICP costs beside a detector, and how far off its poses are."""
-    given = recorded(data, frames) if data else simulated(streets, frames)
+    given = read_scans(data, frames) if data else simulate_scans(streets, frames)
     content = measured(show_progress(given, "driving", frames * (1 if data else streets)),
                        DETECTORS if data else ())
     table = Table(title="A scan: CPU ms; metres off over 1 frame, over 10")

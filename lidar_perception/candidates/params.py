@@ -87,7 +87,7 @@ class SeedParams(Params):
     source: str = param("file", "ground_truth: the nearest labelled Pedestrian of the frame (the "
                         "paper's protocol). click: the cluster at /clicked_point. file: a saved "
                         "template. automatic: the cluster of the frame that resembles a "
-                        "pedestrian most, by default the template.", choices=SEED_SOURCES)
+                        "pedestrian most, or the template if there is none.", choices=SEED_SOURCES)
     file: str = param("", "Template file for source 'file', or several separated by commas; empty: "
                       "the shipped one.")
     bank: int = param(1, "Number of the last clicks whose seeds are kept for source 'click'. A "

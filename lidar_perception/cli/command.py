@@ -76,7 +76,7 @@ class Command(click.Command):
     def remedy(self, flag: str) -> str:
         """Return the remedy for an unknown flag that an option knows; "" without one."""
         return next((text for param in self.params if isinstance(param, HelpfulOption)
-                     and (text := param.instead_of(flag))), "")
+                     and (text := param.suggest_option(flag))), "")
 
 
 class HelpfulOption(click.Option):
@@ -92,7 +92,7 @@ class HelpfulOption(click.Option):
         """Return the listing, with the options that were given."""
         raise NotImplementedError
 
-    def instead_of(self, flag: str) -> str:
+    def suggest_option(self, flag: str) -> str:
         """Return the remedy for an unknown flag that this option replaces; otherwise ""."""
         return ""
 

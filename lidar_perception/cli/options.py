@@ -134,7 +134,7 @@ class SetOption(HelpfulOption):
         return "\n".join(line for each in self.runs(given) for line in (
             f"Parameters of {each.name}:", *describe_fields(each.fields)))
 
-    def instead_of(self, flag: str) -> str:
+    def suggest_option(self, flag: str) -> str:
         plain = flag.removeprefix("--").removeprefix("no-")
         known = {name.replace(".", "-").replace("_", "-"): name for node in NODES
                  for name in find_node_parameters(node)}

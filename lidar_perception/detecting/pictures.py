@@ -108,7 +108,7 @@ class PictureWriter:
 
 
 class VideoWriter:
-    """Writes a video of all frames, with the durations of the recording."""
+    """Writes a video of all frames, timed as in the recording."""
 
     needs_scans = True
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from lidar_perception.simulation.drive import drive_frame, longest_drive, simulate_scan
+from lidar_perception.simulation.drive import choose_drive_frame, longest_drive, simulate_scan
 from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.types import InputError
@@ -45,7 +45,7 @@ def _training_scans(seed: int, sensor: Sensor, scenes: Scenes,
     scans = ((number, moment) for number in itertools.count(seed + first, step)
              for moment in range(moments))  # itertools.product would never start
     for number, moment in scans:
-        scan = simulate_scan(number, drive_frame(moment, moments, sensor), sensor, scenes)
+        scan = simulate_scan(number, choose_drive_frame(moment, moments, sensor), sensor, scenes)
         arrays = {
             "points": scan.frame.points(),
             "boxes": scan.truth.boxes.astype(np.float32),

@@ -51,7 +51,7 @@ def longest_drive(sensor: Sensor) -> int:
     return int(DRIVE_SECONDS * sensor.rate)
 
 
-def drive_frame(moment: int, moments: int, sensor: Sensor) -> int:
+def choose_drive_frame(moment: int, moments: int, sensor: Sensor) -> int:
     """Return the number of the scan at one of several moments spread evenly over a drive."""
     return moment * longest_drive(sensor) // moments
 

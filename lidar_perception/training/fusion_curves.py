@@ -228,7 +228,7 @@ def _make_sampler(params: FusedDetectorParams,
 def fit_classes(samples: Samples, before: Models) -> tuple[Models, dict[str, ClassFit]]:
     """Fit the curves of each class, and score old and new ones on scans they were not fitted to.
 
-    Classes with too few samples keep the curves of before, if it has any.
+    Classes with too few samples keep their curves from `before`, if any.
     """
     models, fits = dict(before), {}
     for name in DETECTED:

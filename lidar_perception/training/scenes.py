@@ -22,7 +22,7 @@ from lidar_perception.simulation.camera import (
     select_labels,
     turn_camera,
 )
-from lidar_perception.simulation.drive import drive_frame, simulate_scan
+from lidar_perception.simulation.drive import choose_drive_frame, simulate_scan
 from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.augment import TrainingScene
@@ -123,7 +123,7 @@ class SimulatedScenes:
     def locate(self, i: int) -> tuple[int, int]:
         """Return the seed of scan i's scene, and the number of the frame in its drive."""
         scene, part = divmod(i, self.per_scene)
-        return self.first + scene, drive_frame(part, self.per_scene, self.sensor)
+        return self.first + scene, choose_drive_frame(part, self.per_scene, self.sensor)
 
     def key(self, i: int) -> str:
         """Return a cache key of scan i."""

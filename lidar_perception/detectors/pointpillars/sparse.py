@@ -161,7 +161,7 @@ class SparseNetwork:
         """Return the cells (H, W) bool that each layer has to compute."""
         masks = list(occupied)
         for layer in self.layers:
-            masks.append(layer.reached(masks))
+            masks.append(layer.find_reached(masks))
         if reach is None:
             masks[-1] = np.ones_like(masks[-1])
         else:

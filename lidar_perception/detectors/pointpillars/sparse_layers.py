@@ -50,7 +50,7 @@ class Layer:
         height, width = grids[self.sources[0]]
         return height // self.stride, width // self.stride
 
-    def reached(self, occupied: Sequence[np.ndarray]) -> np.ndarray:
+    def find_reached(self, occupied: Sequence[np.ndarray]) -> np.ndarray:
         """Return (H, W) bool, True where its value depends on an occupied cell of earlier maps."""
         read = np.logical_or.reduce([occupied[source] for source in self.sources])
         mask = dilate(read, self.window)[::self.stride, ::self.stride]

@@ -40,7 +40,7 @@ def make_traffic_light(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_sign(rng: np.random.Generator) -> np.ndarray:
-    """Make a post with one or two retroreflective plates to +x; some are low, as on islands.
+    """Make a post with one or two retroreflective plates facing +x; some are low, as on islands.
 
     Half of the low ones are on a mast. Of KITTI's clusters as wide as a person, 15 % are partly
     retroreflective, most of them low.
