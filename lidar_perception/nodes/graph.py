@@ -97,6 +97,25 @@ def build_graph(detectors: Sequence[str], single: bool = False,
     return {k: v for part in ([] if single else [EXPERTS]) + parts for k, v in part.items()}
 
 
+def find_expert_range(detectors: Sequence[str], params: Mapping[str, Any]) -> str:
+    """Return the parameter range of ground_segmentation: the range that all detectors have.
+
+    Args:
+        detectors: names of detectors.
+        params: parameters of the detectors. Packaged weights see ahead with the range auto.
+
+    Returns:
+        ahead or around; all if a detector needs the whole cloud, has its own weights, or another
+        range than the others.
+    """
+    ranges = set()
+    for name in detectors:
+        chosen = params.get(f"{name}.range", "auto")
+        is_known = name in ("fused", "pointpillars") and not params.get(f"{name}.weights")
+        ranges.add(("ahead" if chosen == "auto" else chosen) if is_known else "all")
+    return ranges.pop() if len(ranges) == 1 else "all"
+
+
 def find_trackers(detectors: Sequence[str]) -> dict[str, str]:
     """Return the detector of each tracker, by the name of the tracker."""
     return {f"{name}_{TRACKER}" if len(detectors) > 1 else TRACKER: name for name in detectors}

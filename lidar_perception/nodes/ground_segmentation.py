@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from lidar_perception.candidates.segmented_cloud import crop_to_view, diagnose_empty
 from lidar_perception.candidates.warm_up import warm_up_ground
+from lidar_perception.detectors.normalized_view import NormalizedView, segment_view_ground
+from lidar_perception.detectors.pointpillars.config import RANGES
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.ground.threshold import compute_inlier_share, fit_plane
 from lidar_perception.nodes.inputs import CameraInput
@@ -15,6 +19,7 @@ from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import GroundNodeParams, GroundRobotParams
 from lidar_perception.runs.compiling import lock_compilation
+from lidar_perception.types import PointCloud
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import scatter_values
 from msg_utils.point_cloud2 import add_columns, from_array, to_array
@@ -46,21 +51,46 @@ class GroundSegmentation(ManagedNode):
             frame, usable, params = self.sensor.read_frame(msg)
             camera = self.camera.get(msg.header, params.view)
             indices, visible_frame = crop_to_view(frame, camera, params.view)
-            ground = segment_ground(visible_frame, params.ground)
-            indices = usable.take(indices)
+            visible = usable.take(indices)
+            if self.node_params.range == "all":
+                segmented, indices, ground = (visible_frame, visible,
+                                              segment_ground(visible_frame, params.ground))
+            else:  # as the detector does without ground
+                view = NormalizedView.of(visible_frame, params.ground.sensor_pose,
+                                         **RANGES[self.node_params.range])
+                segmented, indices, ground = (view.frame, visible.take(view.indices),
+                                              segment_view_ground(view.frame, params.ground))
             self.points.publish(add_columns(
                 msg, bag_message, ground=scatter_values(ground, indices, msg, "u1"),
                 in_view=scatter_values(1, indices, msg, "u1")))
-        for publisher, chosen in ((self.ground, ground), (self.nonground, ~ground)):
-            if publisher.get_subscription_count():
-                publisher.publish(from_array(to_array(msg).take(indices[chosen]), msg.header,
-                                             bag_message))
-        self.obstacles.publish(msg, visible_frame.xyz, ground, indices)
-        plane = fit_plane(visible_frame.xyz.compress(ground, axis=0))
+        self._publish_parts(msg, visible_frame, visible, params,
+                            ground if self.node_params.range == "all" else None)
+        plane = fit_plane(segmented.xyz.compress(ground, axis=0))
         if plane is not None:
-            share = compute_inlier_share(visible_frame.xyz, plane)
+            share = compute_inlier_share(segmented.xyz, plane)
             self.counts.update(plane=" ".join(f"{v:.4f}" for v in plane),
                                plane_inlier_share=f"{share:.3f}",
                                ground_share=f"{ground.mean():.3f}")
         problem = diagnose_empty(len(frame), ground) or self.sensor.find_problem(frame, params)
         self.report(WARN if problem else OK, problem or "segmenting")
+
+    def _publish_parts(self, msg: Any, frame: PointCloud, indices: np.ndarray, params: Any,
+                       ground: np.ndarray | None) -> None:
+        """Publish ~/output/ground, nonground and obstacles if anybody subscribes.
+
+        Args:
+            msg: the cloud.
+            frame: its visible points.
+            indices: (M,) indices of these points in the cloud.
+            ground: (M,) bool; computed here if it is None.
+        """
+        parts = self.ground, self.nonground, self.obstacles.publisher
+        if not any(publisher.get_subscription_count() for publisher in parts):
+            return
+        if ground is None:
+            ground = segment_ground(frame, params.ground)
+        for publisher, chosen in ((self.ground, ground), (self.nonground, ~ground)):
+            if publisher.get_subscription_count():
+                publisher.publish(from_array(to_array(msg).take(indices[chosen]), msg.header,
+                                             bag_message))
+        self.obstacles.publish(msg, frame.xyz, ground, indices)

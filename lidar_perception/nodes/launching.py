@@ -32,6 +32,7 @@ from lidar_perception.nodes.graph import (
     add_node_prefix,
     build_graph,
     find_executable,
+    find_expert_range,
     find_trackers,
     prefers_one_process,
     relative_name,
@@ -199,7 +200,8 @@ def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
               "respawn": value["respawn"] == "true", "respawn_delay": RESPAWN_DELAY_S}
     nodes: list[dict[str, Any]] = [dict(
         executable=find_executable(base := node.removeprefix(prefix)), name=node,
-        parameters=add_arguments(files[base], node, _argument_parameters(value, base, detectors)),
+        parameters=[*add_arguments(files[base], node, _argument_parameters(value, base, detectors)),
+                    *(_list_expert_range(value, files) if base == "ground_segmentation" else ())],
         # A parameter file may make any node read odometry; for the others the remapping is void.
         remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_INPUT}.items()],
     ) for node, remap in graph.items()]
@@ -286,6 +288,25 @@ def _read_expert_parameters(files: list[str]) -> dict[str, Any]:
     given = {key: number for file in files for section, values in read_sections(file).items()
              if any(is_for(section, node) for node in EXPERTS) for key, number in values.items()}
     return known | {k: v for k, v in given.items() if k in known}
+
+
+def _list_expert_range(value: dict[str, str], files: dict[str, list[str]]) -> list[dict[str, str]]:
+    """Return the parameter range of ground_segmentation if it is not the default or in a file.
+
+    files: parameter files of each node.
+    """
+    def read(node: str) -> dict[str, Any]:
+        sections = [item for file in files[node] for item in read_sections(file).items()]
+        return {key: given for section, values in sections
+                if is_for(section, value["name_prefix"] + node) for key, given in values.items()}
+
+    params, detectors = read("ground_segmentation"), _detectors(value)
+    if "range" in params:
+        return []
+    for node in [f"{name}_detector" for name in detectors if name in NETWORKS]:
+        params |= read(node) | _argument_parameters(value, node, detectors)
+    chosen = find_expert_range(detectors, params)
+    return [] if chosen == "all" else [{"range": chosen}]
 
 
 def _detectors(value: dict[str, str]) -> list[str]:

@@ -18,8 +18,10 @@ from detector_node import assert_equal
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.cli.demo import RECORD, demo
+from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.open import open_detector
+from lidar_perception.nodes import graph
 from lidar_perception.nodes.graph import FINAL, list_result_topics
 from lidar_perception.nodes.replay import graph_replay
 from lidar_perception.scoring.recorded import read_results
@@ -28,23 +30,33 @@ from lidar_perception.types import InputError
 FRAMES = 4  # tracks are confirmed
 
 
-def test_the_demo_scores_what_fused_finds_offline(drive_bag, make_bag, tmp_path):
+def test_demo_scores_the_offline_result_in_one_process_and_in_many(drive_bag, make_bag, tmp_path,
+                                                                   monkeypatch):
+    """Tracks are equal to the byte."""
     bag = make_bag(open_recording(drive_bag).frames[:FRAMES])
-    outcome = CliRunner().invoke(demo, ["--data", str(bag), "--single",
-                                        "--out", str(tmp_path)])
-    assert outcome.exit_code == 0, outcome.output
-    scores = json.loads((tmp_path / "scores.json").read_text())
     frames = {frame.stamp_ns: frame for frame in open_recording(bag)}
-    found, = read_results(tmp_path / "result", list_result_topics(True, "fused")[FINAL])
-    assert {f.stamp_ns for f in found} == frames.keys() and scores["results"] == len(frames)
     torch.set_num_threads(len(os.sched_getaffinity(0)))  # sums depend on it; nodes take all cores
     fused = open_detector(sensor_height=next(iter(frames.values())).sensor_height)
-    for answer in found:
-        assert_equal(answer.found, fused(frames[answer.stamp_ns].load()).detections)
-    people = scores["detections"]["Pedestrian"]
-    assert people["hits"] > 0 and people["hits"] + people["missed"] == people["labels"]
-    assert scores["tracks"]["scores"]["Pedestrian"]["hits"] > 0
-    assert (tmp_path / "birdseye.png").stat().st_size > 10_000
+    expected = {stamp: fused(frame.load()).detections for stamp, frame in frames.items()}
+    monkeypatch.setattr(graph, "count_cores", lambda: 1)
+    tracks = []
+    for name, arguments in ("one", []), ("many", ["--processes"]):
+        out = tmp_path / name
+        outcome = CliRunner().invoke(demo, ["--data", str(bag), *arguments, "--out", str(out)])
+        assert outcome.exit_code == 0, outcome.output
+        scores = json.loads((out / "scores.json").read_text())
+        found, = read_results(out / "result", list_result_topics(False, "fused")[FINAL])
+        assert {f.stamp_ns for f in found} == frames.keys() and scores["results"] == len(frames)
+        for answer in found:
+            assert_equal(answer.found, expected[answer.stamp_ns])
+        people = scores["detections"]["Pedestrian"]
+        assert people["hits"] > 0 and people["hits"] + people["missed"] == people["labels"]
+        assert scores["tracks"]["scores"]["Pedestrian"]["hits"] > 0
+        assert (out / "birdseye.png").stat().st_size > 10_000
+        assert ("graph" in scores["memory_mb_by_process"]) == (name == "one")
+        with Bag(out / "result") as result:
+            tracks.append([data for _, _, data in result.raw_messages({graph_replay.TRACKS})])
+    assert tracks[0] == tracks[1] and len(tracks[0]) == FRAMES
 
 
 @pytest.mark.parametrize(("real_time", "waiting"), [(False, graph_replay.AHEAD), (True, None)])

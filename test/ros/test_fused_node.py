@@ -11,14 +11,21 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from detection_samples import frame
 from detector_node import DetectorUnderTest, assert_equal, message, received, small_v4
-from test_bad_input import BAD, cloud
+from test_bad_input import BAD, CLOUD, cloud
 
+from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.fused.detector import load_fused_detector
-from lidar_perception.detectors.fused.fusion import load_shipped_models, write_fusion
-from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams
+from lidar_perception.detectors.fused.fusion import load_shipped_models, weights_file, write_fusion
+from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
+from lidar_perception.detectors.normalized_view import NormalizedView, segment_view_ground
+from lidar_perception.detectors.pointpillars.config import AHEAD, RANGES, NetworkConfig
+from lidar_perception.ground.segment import segment_ground
 from lidar_perception.nodes.fused_detector import FusedNode
 from lidar_perception.nodes.graph import build_graph
+from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.param_fields import with_values
+from lidar_perception.wire.codec import decode
+from lidar_perception.wire.messages import read_column, to_point_cloud
 from msg_utils.markers import from_marker_array
 
 NODE = "fused_detector"
@@ -97,3 +104,21 @@ class Posts:
     found = from_marker_array(deserialize_message(node.sent["detections"][-1], MarkerArray))
     assert found.labels == ["Pedestrian"] and found.boxes[0, 5] == pytest.approx(0.5)
     assert node.counts["network"] == "own_fused:Posts, Pedestrian"
+
+
+@pytest.mark.parametrize("range", ["ahead", "around"])
+def test_experts_segment_the_points_that_the_detector_reads(start, range):
+    """Ground as the detector computes it; the parts of the cloud have all its points."""
+    node = start(GroundSegmentation, range=range, **{"ground.method": "patchwork"})
+    assert read_header(weights_file(FusedParams()), NetworkConfig).config.low == AHEAD["low"]
+    cloud = message(1)
+    node.nonground.publisher.get_subscription_count = lambda: 1
+    node.on_points(cloud)
+    got, rest = (decode(node.sent[name][0], CLOUD) for name in ("points", "nonground"))
+    _, indices = to_point_cloud(got, 0.0)
+    whole, everything = to_point_cloud(cloud, 0.0)
+    view = NormalizedView.of(whole, node.params.ground.sensor_pose, **RANGES[range])
+    np.testing.assert_array_equal(indices, everything[view.indices])
+    np.testing.assert_array_equal(read_column(got, "ground", indices) > 0,
+                                  segment_view_ground(view.frame, node.params.ground))
+    assert rest.width == (~segment_ground(whole, node.params.ground)).sum()

@@ -150,6 +150,23 @@ def test_graph_is_one_process_on_few_cores(processes, cores, together, launched,
                                            else {"/**": parameters})
 
 
+@pytest.mark.parametrize(("detectors", "given", "expected"), [
+    ("fused", {}, "ahead"), ("pointpillars,fused", {}, "ahead"), ("pointnet,fused", {}, None),
+    ("fused", {"range": "around"}, "around"), ("candidates", {}, None),
+    ("fused", {"weights": "mine.safetensors"}, None),
+    ("pointpillars,fused", {"config": "fused.range: around"}, None),
+    ("fused", {"config": "fused.range: around"}, "around"),
+    ("fused", {"config": "range: all"}, None)])
+def test_experts_have_the_range_of_the_detectors(detectors, given, expected, launched, tmp_path):
+    _, nodes = launched("detectors")
+    if "config" in given:
+        mine = tmp_path / "mine.yaml"
+        mine.write_text(f"/**: {{ros__parameters: {{{given['config']}}}}}")
+        given = {"config": str(mine)}
+    *_, last = nodes(detectors=detectors, **given)["ground_segmentation"].parameters
+    assert (last.get("range") if isinstance(last, dict) else None) == expected
+
+
 def test_ground_and_cluster_file_rejects_other_arguments(launched, tmp_path):
     """That of the first detector, of the one that is named, or one of the user's."""
     _, nodes = launched("detectors")

@@ -21,6 +21,7 @@ from lidar_perception.nodes.graph import (
     cloud_topic,
     configure_evaluator,
     find_connected_outputs,
+    find_expert_range,
     list_awaited_topics,
     list_result_topics,
     prefers_one_process,
@@ -85,6 +86,9 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
     settings = {**flatten(params), **({} if real_time else {"input.queue": AHEAD})}
     nodes: dict[str, tuple[Mapping[str, str], dict[str, Any]]] = {
         node: (remap, settings) for node, remap in graph.items()}
+    if "ground_segmentation" in graph:
+        nodes["ground_segmentation"] = graph["ground_segmentation"], settings | {
+            "range": find_expert_range([detector], settings)}
     nodes[TRACKER] = graph[TRACKER], {
         "ego.source": "odometry" if poses == "recording" else poses,
         **({} if real_time else {"ego.max_wait": SILENCE_TIMEOUT_S})}
