@@ -105,7 +105,8 @@ PAGES: dict[str, dict[str, Any]] = {
              "simulation (`ground.method`). Warns if the height of the sensor differs from "
              "`sensor_pose`, or if the scale of the intensity does not fit.",
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape."), *CAMERA_IN],
-        outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS}."),
+        outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS}; `in_view` is 2 "
+                  "outside `range`."),
                  ("~/output/ground", CLOUD, "Ground points; published only while subscribed."),
                  ("~/output/nonground", CLOUD, "The other points in view; published only while "
                   "subscribed."),

@@ -115,7 +115,7 @@ class GroundRobotParams(CloudNodeParams):
 
     range: str = param(
         "all", "Segment only the points that a detector with this range reads, see `fused.range`; "
-        "the others have 0 in `in_view`. Launch files and `demo` set it if all detectors have the "
+        "the others have 2 in `in_view`. Launch files and `demo` set it if all detectors have the "
         "same range. The outputs ground, nonground and obstacles always cover the whole cloud.",
         choices=("all", "ahead", "around"))
     obstacles: ObstacleParams = ObstacleParams()

@@ -15,7 +15,7 @@ from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.params import BoxNodeParams, ClusteringNodeParams
 from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import read_column, scatter_values, to_point_cloud
+from lidar_perception.wire.messages import OUT_OF_RANGE, read_column, scatter_values, to_point_cloud
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
 
@@ -39,6 +39,10 @@ class Clustering(ManagedNode):
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, indices = to_point_cloud(msg)
+            in_view = read_column(msg, "in_view", indices)
+            if in_view is not None and (in_view == OUT_OF_RANGE).any():
+                kept = np.flatnonzero(in_view != OUT_OF_RANGE)
+                frame, indices = frame.take(kept), indices.take(kept)
             frame = self.transforms.find_placement(msg.header).level_frame(frame)
             column = read_column(msg, "ground", indices)
             ground = np.zeros(len(frame), bool) if column is None else column > 0

@@ -21,7 +21,7 @@ from lidar_perception.params import GroundNodeParams, GroundRobotParams
 from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.types import PointCloud
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import scatter_values
+from lidar_perception.wire.messages import IN_VIEW, OUT_OF_RANGE, scatter_values
 from msg_utils.point_cloud2 import add_columns, from_array, to_array
 from msg_utils.stamps import to_ns
 
@@ -60,9 +60,11 @@ class GroundSegmentation(ManagedNode):
                                          **RANGES[self.node_params.range])
                 segmented, indices, ground = (view.frame, visible.take(view.indices),
                                               segment_view_ground(view.frame, params.ground))
+            in_view = scatter_values(OUT_OF_RANGE, visible, msg, "u1")
+            in_view[indices] = IN_VIEW
             self.points.publish(add_columns(
                 msg, bag_message, ground=scatter_values(ground, indices, msg, "u1"),
-                in_view=scatter_values(1, indices, msg, "u1")))
+                in_view=in_view))
         self._publish_parts(msg, visible_frame, visible, params,
                             ground if self.node_params.range == "all" else None)
         plane = fit_plane(segmented.xyz.compress(ground, axis=0))

@@ -39,6 +39,7 @@ from msg_utils.markers import (
 from msg_utils.point_cloud2 import CloudError, from_array, read_columns, read_xyz, to_array
 from msg_utils.stamps import to_ns
 
+IN_VIEW, OUT_OF_RANGE = 1, 2  # in the column in_view: segmented, or not as no detector reads it
 MAX_ID = 2**31  # marker ids are int32
 FullScale = Callable[[np.ndarray, DTypeLike], float]  # see intensity.full_scale
 

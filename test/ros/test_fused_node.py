@@ -25,8 +25,9 @@ from lidar_perception.nodes.graph import build_graph
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.param_fields import with_values
 from lidar_perception.wire.codec import decode
-from lidar_perception.wire.messages import read_column, to_point_cloud
+from lidar_perception.wire.messages import IN_VIEW, read_column, to_point_cloud
 from msg_utils.markers import from_marker_array
+from msg_utils.point_cloud2 import to_array
 
 NODE = "fused_detector"
 FILE = Path(__file__).resolve().parents[2] / "config" / "fused.param.yaml"
@@ -115,7 +116,8 @@ def test_experts_segment_the_points_that_the_detector_reads(start, range):
     node.nonground.publisher.get_subscription_count = lambda: 1
     node.on_points(cloud)
     got, rest = (decode(node.sent[name][0], CLOUD) for name in ("points", "nonground"))
-    _, indices = to_point_cloud(got, 0.0)
+    indices = np.flatnonzero(to_array(got)["in_view"] == IN_VIEW)
+    np.testing.assert_array_equal(to_point_cloud(got)[1], to_point_cloud(cloud)[1])
     whole, everything = to_point_cloud(cloud, 0.0)
     view = NormalizedView.of(whole, node.params.ground.sensor_pose, **RANGES[range])
     np.testing.assert_array_equal(indices, everything[view.indices])

@@ -154,7 +154,8 @@ def test_nodes_of_one_process_have_their_own_parameters_and_end_at_a_signal(proc
                    tracker={"autostart": False})
     peer.wait(lambda: set(NODES) <= set(peer.diagnostics), "all nodes")
     assert peer.get_message("tracker") == "not configured"
-    assert peer.get_value("ground_segmentation", f"subscribers of {GROUND_POINTS}") == "1"
+    peer.wait(lambda: peer.get_value("ground_segmentation", f"subscribers of {GROUND_POINTS}"
+                                     ) == "1", "the link")
     assert peer.set_parameters("/clustering", {"clustering.dbscan.min_samples": 7}) == []
     processes.running["graph"].send_signal(SIGINT)
     peer.spin_until(lambda: processes.has_ended("graph"), 15.0)
