@@ -1,4 +1,4 @@
-"""What tests of nodes share: a cloud as a message, nodes in this process."""
+"""Fixtures for tests of nodes: a cloud message, a detector's graph, nodes in this process."""
 
 from multiprocessing import forkserver
 
@@ -7,9 +7,9 @@ import pytest
 
 @pytest.fixture(scope="session")
 def domain(domain) -> int:
-    """The nodes of these tests are forked from a process whose lines are not measured: tests with a
-    node in their own process run nearly all of them."""
-    from lidar_perception.testing import forking  # noqa: F401  it says what that process loads
+    """Nodes are forked from a process without coverage: nodes in the process of a test cover
+    nearly all lines."""
+    from lidar_perception.testing import forking  # noqa: F401  sets what that process loads
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)
         forkserver.ensure_running()
@@ -18,7 +18,7 @@ def domain(domain) -> int:
 
 @pytest.fixture(scope="session")
 def good_cloud(drive_bag):
-    """The first of the simulated drive."""
+    """First cloud of the simulated drive."""
     from lidar_perception.data.bag import Bag
     from lidar_perception.wire.topics import POINTS
     with Bag(drive_bag) as bag:
@@ -26,13 +26,12 @@ def good_cloud(drive_bag):
 
 
 @pytest.fixture(scope="module")
-def found(request, shared_processes, shared_peer, weights):
-    """What the graph of the module's DETECTOR detects with its weights."""
-    from test_bad_input import MARKERS, QUIET
+def found(tested, shared_processes, shared_peer, weights):
+    """Detections of the graph of the detector `tested` with its weights."""
+    from ros_samples import MARKERS, QUIET
 
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
-    tested = request.module.DETECTOR
     for node, remap in tested.graph.items():
         shared_processes.start(node, remap, {**read_config(tested.stages, PipelineParams()), **(
             {**tested.values(weights), **QUIET} if node == tested.node else {})})
@@ -40,15 +39,15 @@ def found(request, shared_processes, shared_peer, weights):
 
 
 @pytest.fixture(scope="module")
-def talker(request, shared_peer, found):
-    """Straight to the detector."""
-    from test_bad_input import CLOUD
-    return shared_peer.advertise(request.module.DETECTOR.between, CLOUD)
+def talker(tested, shared_peer, found):
+    """Publisher of clouds for the detector."""
+    from ros_samples import CLOUD
+    return shared_peer.advertise(tested.between, CLOUD)
 
 
 @pytest.fixture
 def start(domain):
-    """Makes a node in this process; what it publishes grows in node.sent, by topic."""
+    """Make a node in this process; node.sent collects its messages by topic."""
     from rclpy.parameter import Parameter
 
     from lidar_perception.nodes.external_node import create_context, shut_down_context

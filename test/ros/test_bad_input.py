@@ -7,64 +7,20 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from ros_samples import BAD, CLOUD, MARKERS, QUIET, big_endian, cloud
+
 from lidar_perception.data.open import open_recording
 from lidar_perception.scoring.centres.report import select_pedestrians
-from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.testing.detections import assert_detections
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_point_cloud
 from msg_utils.markers import from_marker_array
-from msg_utils.point_cloud2 import from_array, to_array
+from msg_utils.point_cloud2 import to_array
 from msg_utils.stamps import make_header, to_ns
-
-CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
-XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
-
-
-def cloud(xyz, stamp=1, **changes):
-    msg = make_cloud_message(xyz, stamp)
-    for name, value in changes.items():
-        setattr(msg, name, value)
-    return msg
 
 
 def xyz_of(msg):
     return to_point_cloud(msg)[0].xyz
-
-
-def without_x():
-    msg = cloud(np.ones((5, 3)))
-    msg.fields[0].name = "a"
-    return msg
-
-
-def integer_z():
-    msg = cloud(np.ones((5, 3)))
-    msg.fields[2].datatype = 5
-    return msg
-
-
-def big_endian(xyz, stamp):
-    points = np.asarray(xyz, np.float32).view(XYZ).reshape(-1).astype(XYZ.newbyteorder(">"))
-    return from_array(points, make_header(stamp, "lidar", bag_message), bag_message)
-
-
-BAD = {  # what is wrong -> message, words that the diagnostic must hold
-    "empty": (cloud(np.zeros((0, 3))), "no finite point"),
-    "missing x": (without_x(), "no field 'x'"),
-    "no fields at all": (bag_message(CLOUD), "no field 'x'"),
-    "all NaN": (cloud(np.full((9, 3), np.nan)), "no finite point"),
-    "cut": (cloud(np.ones((5, 3)), data=np.zeros(7, np.uint8)), "7 bytes"),
-    "all infinite": (cloud(np.full((9, 3), np.inf)), "no finite point"),
-    "integer z": (integer_z(), "'z'"),
-    "more points than bytes": (cloud(np.ones((5, 3)), width=2**31), "bytes"),
-    "point_step 0": (cloud(np.ones((5, 3)), point_step=0), "point_step"),
-    "one point": (cloud([[5, 0, -1]]), "no ground"),
-}
-
-
-QUIET = {"input.queue": 5, "input.min_rate": 0.0, "input.error_after": 1e6,
-         "input.stale_after": 1e6}
 
 
 @pytest.fixture(scope="module")

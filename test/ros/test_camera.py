@@ -7,8 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from test_bad_input import CLOUD, MARKERS
-from test_graph import PAPER
+from ros_samples import CLOUD, MARKERS, PAPER
 
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.data.bag import Bag

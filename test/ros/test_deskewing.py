@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from test_robot_frames import PERIOD, START, give, message, mounted, odometry, problems, transforms
+from robot_messages import PERIOD, START, give, message, mounted, odometry, problems, transforms
 
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.robot.deskew import make_constant_motion, skew

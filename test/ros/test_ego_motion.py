@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from rclpy.parameter import Parameter
-from test_robot_frames import message, mounted, odometry, transforms, walker
+from robot_messages import message, mounted, odometry, transforms, walker
 from tracking_samples import START, TENTH, crowd, pose
 
 from lidar_perception.classes import CAR, CYCLIST, PEDESTRIAN

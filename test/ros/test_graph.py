@@ -9,7 +9,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from lidar_perception.candidates.params import PipelineParams
+from ros_samples import PAPER
+
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
@@ -27,9 +28,6 @@ from lidar_perception.wire.messages import read_column, to_detections, to_point_
 from lidar_perception.wire.topics import POINTS
 from msg_utils.markers import from_marker_array
 from msg_utils.point_cloud2 import to_array
-
-PAPER = with_values(PipelineParams(), {"view.enabled": True, "seed.source": "ground_truth"})
-
 
 PAPER_C = {"ground.method": "cloth", "clustering.method": "euclidean", "boxes.shape": "l_shape"}
 RUNS = {  # (single, processes, parameters in addition to PAPER)

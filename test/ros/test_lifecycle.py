@@ -9,12 +9,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from detector_node import POINTPILLARS_NODE as DETECTOR
 from detector_node import REMAP, assert_equal, message, received
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.parameter import Parameter
-from test_bad_input import CLOUD, MARKERS
-from test_pointpillars_node import DETECTOR, NODE, offline
+from ros_samples import CLOUD, MARKERS
 
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
@@ -25,6 +25,7 @@ from lidar_perception.nodes.tracker import TrackerNode
 from lidar_perception.wire.codec import encode
 from msg_utils.messages import make_ros_message
 
+NODE, offline = DETECTOR.node, DETECTOR.offline
 pytestmark = pytest.mark.usefixtures("one_thread")
 LEADS_TO = {"configure": State.PRIMARY_STATE_INACTIVE, "activate": State.PRIMARY_STATE_ACTIVE,
             "deactivate": State.PRIMARY_STATE_INACTIVE, "cleanup": State.PRIMARY_STATE_UNCONFIGURED,
@@ -139,8 +140,8 @@ def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
     drive(peer, node, "deactivate", "cleanup", "unconfigured_shutdown")
     process = f"ready.{NODE}"
     assert not nodes.has_ended(process) and nodes.end(process) == 0
-    assert "is not possible: the node is active\n" in nodes.log(process)
-    assert "Traceback" not in nodes.log(process)
+    assert "is not possible: the node is active\n" in nodes.read_log(process)
+    assert "Traceback" not in nodes.read_log(process)
 
 
 def test_node_without_subscribers_reports_it(here, peer, monkeypatch):
@@ -206,7 +207,7 @@ def test_node_waits_for_missing_network_file(nodes, peer, later, weights):
     for node in (driven, alone):
         peer.wait_for_diagnostics(node, reason, level=2)
         peer.wait(lambda n=node: peer.get_value(n, "lifecycle") == "unconfigured", "the state")
-        assert "ready" not in nodes.log(node.replace("/", "."))
+        assert "ready" not in nodes.read_log(node.replace("/", "."))
     part = later.with_name("part")
     part.write_bytes(weights.read_bytes())
     part.rename(later)
@@ -216,7 +217,7 @@ def test_node_waits_for_missing_network_file(nodes, peer, later, weights):
         found = peer.listen(f"/{node}/output/detections", MARKERS)
         peer.send(talker, message(1), lambda f=found: received(f, 1), "detections")
         assert_equal(received(found, 1), offline(weights, message(1)))
-    log = nodes.log(f"tries.{NODE}")
+    log = nodes.read_log(f"tries.{NODE}")
     assert log.count(reason) == 1 and log.index(reason) < log.index(": ready")
 
 

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from browsing import browsing
-from test_robot_frames import mounted, transforms
+from robot_messages import mounted, transforms
 
 from lidar_perception.nodes.graph import SINGLE
 from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, has_tf

@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from rclpy.executors import SingleThreadedExecutor
-from test_bad_input import CLOUD, MARKERS, cloud
+from ros_samples import CLOUD, MARKERS, cloud
 
 from lidar_perception.nodes import reception as reception_module
 from lidar_perception.nodes.arrivals import RATE_INTERVALS

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from test_robot_frames import PERIOD, START, WALKING, message, mounted, transforms, walker
+from robot_messages import PERIOD, START, WALKING, message, mounted, transforms, walker
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from rclpy.qos import QoSProfile
-from test_bad_input import MARKERS
+from ros_samples import MARKERS
 from tracking_samples import CAR, CYCLIST, START, TENTH, car, cars, crowd, person, pose
 
 from lidar_perception.candidates.configurations import BEST
