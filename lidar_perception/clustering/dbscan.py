@@ -9,11 +9,10 @@ from itertools import pairwise
 
 import numpy as np
 from numba import njit
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from lidar_perception.clustering.dbscan_cells import dbscan_by_cells
 from lidar_perception.clustering.dbscan_growth import dbscan_by_growing
+from lidar_perception.clustering.grid import find_root
 from lidar_perception.clustering.params import DbscanParams
 from lidar_perception.clustering.thinning import SLACK, max_exact_distances, thin_points
 from lidar_perception.clustering.tree import build_tree, find_touching_labels
@@ -73,31 +72,50 @@ def _join_bands(xyz: np.ndarray, bands: list[np.ndarray], labels: np.ndarray,
 
     bands holds the indices of each band's points.
     """
-    count = int(labels.max(initial=0))
-    pairs = [np.zeros((0, 2), np.int64)]
+    parent = np.arange(int(labels.max(initial=0)) + 1, dtype=np.int32)
+    ranges = horizontal_range(xyz)
     clustered = [indices[labels[indices] > 0] for indices in bands]
     for inner, outer, reach in zip(clustered, clustered[1:], map(min, eps, eps[1:])):
         if len(inner) and len(outer):
-            pairs.append(_find_touching_clusters(xyz, labels, inner, outer, reach))
-    joined = np.unique(np.concatenate(pairs), axis=0)
-    graph = coo_matrix((np.ones(len(joined)), joined.T), shape=(count + 1, count + 1))
-    _, component = connected_components(graph, directed=False)
+            inner_range, outer_range = ranges[inner], ranges[outer]
+            inner = inner[inner_range >= outer_range.min() - reach]
+            outer = outer[outer_range <= inner_range.max() + reach]
+            if len(inner) and len(outer):
+                _join_labels(parent, _find_touching_clusters(xyz, labels, inner, outer, reach))
     # Components are numbered by their first member; noise (0) is never joined, so it keeps 0.
-    return component[labels].astype(np.int32)
+    return _number_roots(parent)[labels]
+
+
+@njit(cache=True, nogil=True)
+def _join_labels(parent, pairs):
+    for k in range(len(pairs)):
+        one, other = find_root(parent, pairs[k, 0]), find_root(parent, pairs[k, 1])
+        parent[max(one, other)] = min(one, other)
+
+
+@njit(cache=True, nogil=True)
+def _number_roots(parent):
+    """Return (S,) int32 the number of each item's set in a forest whose roots are the least items:
+    0, 1, ... in the order of the roots."""
+    number, count = np.empty(len(parent), np.int32), 0
+    for i in range(len(parent)):
+        root = find_root(parent, i)
+        if root == i:
+            number[i] = count
+            count += 1
+        else:
+            number[i] = number[root]
+    return number
 
 
 def _find_touching_clusters(xyz: np.ndarray, labels: np.ndarray, inner: np.ndarray,
                             outer: np.ndarray, reach: float) -> np.ndarray:
     """Return pairs of labels (P, 2) that connect all clusters with points within reach.
 
-    inner and outer are the indices of the points of two neighbouring bands. The pairs form a
-    forest: they connect all clusters that touch, and P is less than the number of labels.
+    inner and outer are the indices of points of two neighbouring bands that may be within reach,
+    at least one each. The pairs form a forest: they connect all clusters that touch, and P is less
+    than the number of labels.
     """
-    inner_range, outer_range = (horizontal_range(xyz[side]) for side in (inner, outer))
-    inner = inner[inner_range >= outer_range.min() - reach]
-    outer = outer[outer_range <= inner_range.max() + reach]
-    if len(inner) == 0 or len(outer) == 0:
-        return np.zeros((0, 2), np.int64)
     rows = np.concatenate([inner, outer])
     names, label = np.unique(labels[rows], return_inverse=True)
     side = (np.arange(len(rows)) >= len(inner)).astype(np.int64)

@@ -29,7 +29,7 @@ from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.fused.detector import FusedDetector, remove_duplicates
 from lidar_perception.detectors.fused.evidence import MIN_PROBABILITY, to_log_odds
 from lidar_perception.detectors.fused.fusion import KNOTS, load_shipped_models
-from lidar_perception.detectors.fused.model import compute_probabilities
+from lidar_perception.detectors.fused.model import compute_max_probabilities, compute_probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.normalized_view import drop_ego_vehicle
 from lidar_perception.detectors.pointnet import classifier
@@ -164,6 +164,22 @@ def test_more_evidence_is_never_less_likely_and_silence_is_neither(seed):
     assert not compute_probabilities(load_shipped_models(), unknown, evidence).any()
     least = to_log_odds(MIN_PROBABILITY)
     np.testing.assert_allclose(to_log_odds([0, 0.5, 1]), [least, 0, -least], atol=1e-9)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_bound_of_a_probability_holds_for_any_answer_and_any_curve(seed):
+    """PointNet is not asked about proposals whose bound is below the threshold."""
+    rng = np.random.default_rng(seed)
+    models = {name: {"bias": rng.normal(), "curves": {
+        source: {"knots": [-3.0, -1.0, 1.0, 3.0], "values": rng.normal(0, 2, 4).tolist(),
+                 **({"unknown": rng.normal(0, 2)} if rng.random() < 0.5 else {})}
+        for source in ("network", "classifier")[:rng.integers(1, 3)]}} for name in CLASSES[:2]}
+    ids, network = rng.integers(0, 3, 6), rng.normal(0, 3, 6)
+    bound = compute_max_probabilities(models, ids, {"network": network}, "classifier")
+    answers = [compute_probabilities(models, ids, {"network": network,
+                                                   "classifier": np.full(6, odds)})
+               for odds in (np.nan, -np.inf, np.inf, *np.linspace(-4, 4, 33))]
+    np.testing.assert_array_equal(bound, np.max(answers, axis=0))
 
 
 def test_people_at_one_place_are_one_and_cars_do_not_share_any():

@@ -33,13 +33,19 @@ def compute_probabilities(models: Models, class_ids: np.ndarray, evidence: Evide
 
 
 def compute_max_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence,
-            source: str) -> np.ndarray:
+                              source: str) -> np.ndarray:
     """Return the highest probability (K,) float32 that each proposal can reach once the evidence of
-    `source` is added."""
-    count = len(class_ids)
-    return np.maximum(*(compute_probabilities(models, class_ids,
-                                              {**evidence, source: np.full(count, log_odds)})
-                        for log_odds in (np.inf, np.nan)))
+    `source` is added, whatever it says.
+
+    A curve is linear between its knots and constant beyond, so its maximum is at a knot or, without
+    evidence, its value for unknown.
+    """
+    best = np.full(len(class_ids), np.nan)
+    for class_id in np.unique(class_ids):
+        curve = models.get(CLASSES[class_id], {"curves": {}})["curves"].get(source)
+        if curve is not None and max(curve["values"]) > curve.get("unknown", 0.0):
+            best[class_ids == class_id] = curve["knots"][int(np.argmax(curve["values"]))]
+    return compute_probabilities(models, class_ids, {**evidence, source: best})
 
 
 def compute_source_probabilities(models: Models, class_ids: np.ndarray,
