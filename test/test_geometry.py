@@ -9,11 +9,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.camera import Camera
+from lidar_perception.clustering.grid import _sort_by_height
 from lidar_perception.geometry import (
     box_corners,
     horizontal_range,
     is_within,
+    lower_bound,
     points_in_box,
+    quantile,
     to_box_frame,
     wrap_angle,
     wrap_line,
@@ -219,3 +222,22 @@ def test_points_behind_the_camera_are_not_in_view():
     assert camera.in_view(-ahead).tolist() == [False]
     assert camera.in_view(np.float32([[0, 0, 0], [0, 3, 1]])).tolist() == [False, False]
     assert camera.in_view(np.zeros((0, 3), np.float32)).shape == (0,)
+
+
+@pytest.mark.parametrize("values", [[3.0], [2.0, 1.0], [1.0] * 40, range(40), range(40, 0, -1),
+                                    np.random.default_rng(0).normal(size=999)])
+def test_quantile_and_lower_bound_equal_numpy(values):
+    values = np.array(values, float)
+    for share in 0.0, 0.1, 0.5, 0.77, 1.0:
+        assert quantile(values.copy(), share) == pytest.approx(
+            np.quantile(values, share), rel=1e-12, abs=1e-12)
+    ascending = np.sort(values)
+    for number in (*ascending[::7], -5.0, 99.0):
+        assert lower_bound(ascending, number) == np.searchsorted(ascending, number)
+
+
+@pytest.mark.parametrize("spread", [10, 10**6, 10**12])
+def test_heights_are_sorted_stably_at_any_distance(spread):
+    z = np.random.default_rng(1).integers(-spread, spread, 300)
+    z[::3] = z[0]
+    np.testing.assert_array_equal(_sort_by_height(z), np.argsort(z, kind="stable"))

@@ -26,6 +26,7 @@ from lidar_perception.candidates.silhouette import (
     count_pixels,
     draw_silhouettes,
 )
+from lidar_perception.geometry import quantile
 
 SHAPE_KNOTS = {  # feature -> knots of its curve, which is constant beyond the first and the last
     "range_m": (5, 10, 15, 20, 30, 40, 55),
@@ -131,5 +132,5 @@ def _compute_moments(xyz, start):
         middle = (along.max() + along.min()) / 2
         out[k] = (np.hypot(x, y), points[:, 2].min(), points[:, 2].max(), np.sqrt(zz / n),
                   along.max() - along.min(), across.max() - across.min(),
-                  abs(np.median(along) - middle))
+                  abs(quantile(along.copy(), 0.5) - middle))
     return out

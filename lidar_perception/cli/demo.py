@@ -36,7 +36,7 @@ from lidar_perception.data.frame import BOXES, Recording
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.contract import FUSED
-from lidar_perception.detectors.open import DetectorChoice
+from lidar_perception.detectors.open import DetectorChoice, open_detector
 from lidar_perception.groups import renumber_ids
 from lidar_perception.nodes import require_rclpy
 from lidar_perception.nodes.graph import (
@@ -45,7 +45,8 @@ from lidar_perception.nodes.graph import (
     cloud_topic,
     list_result_topics,
 )
-from lidar_perception.runs.files import write_text
+from lidar_perception.runs.compiling import compile_meanwhile
+from lidar_perception.runs.files import make_folder, write_text
 from lidar_perception.runs.terminal import console, errors, show_progress
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.tables import print_candidate_report
@@ -123,7 +124,10 @@ def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: i
     if recording is not None:
         recording.require(BOXES, "demo")
     _make_room(out, data, detector)
-    drive = _bag(out / "drive", recording, frames, drive_seed)
+    make_folder(out / "logs")
+    with compile_meanwhile(_code_that_compiles(chosen), out / "logs" / "compile.log",
+                           errors.print):
+        drive = _bag(out / "drive", recording, frames, drive_seed)
     played = _as_replayed(drive, recording)
     clouds = len(played)
     from lidar_perception.nodes.replay.graph_replay import TRACKS, replay
@@ -183,6 +187,14 @@ def _params_of(chosen: DetectorChoice, played: Recording) -> Any:
         warm_up()
         return with_recorded_setup(played, checked(PAPER, chosen.settings))
     return chosen.open(sensor_height=played.frames[0].sensor_height).params
+
+
+def _code_that_compiles(chosen: DetectorChoice) -> str:
+    """Return Python code that compiles what the detector and the nodes before it run."""
+    if chosen.weights == CANDIDATES:
+        return f"from {warm_up.__module__} import warm_up; warm_up()"
+    return (f"from {open_detector.__module__} import open_detector; "
+            f"open_detector({chosen.weights!r}, {chosen.device!r}, range={chosen.range!r})")
 
 
 def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:

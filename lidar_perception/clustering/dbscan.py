@@ -62,7 +62,9 @@ def _sort_by_band(xyz, limits):
     for i in range(len(xyz)):
         # In float32, as horizontal_range computes it.
         distance = np.sqrt(xyz[i, 0] * xyz[i, 0] + xyz[i, 1] * xyz[i, 1])
-        band[i] = np.searchsorted(limits, distance, side="right")
+        band[i] = 0
+        while band[i] < len(limits) and limits[band[i]] <= distance:
+            band[i] += 1
     return counting_sort(band, len(limits) + 1, np.arange(len(xyz)))
 
 

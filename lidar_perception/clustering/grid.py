@@ -93,9 +93,15 @@ def build_grid(xyz, side, reach):
 @njit(cache=True, nogil=True)
 def _sort_by_height(z):
     low, high = z.min(), z.max()
-    if high - low > 8 * len(z) + 4096:  # far outliers make too many levels for a counting sort
-        return np.argsort(z, kind="mergesort")
-    return counting_sort((z - low).astype(np.int32), high - low + 1, np.arange(len(z)))[0]
+    order = np.arange(len(z))
+    if high - low <= 8 * len(z) + 4096:
+        return counting_sort((z - low).astype(np.int32), high - low + 1, order)[0]
+    digit = np.empty(len(z), np.int32)
+    for shift in range(0, 64, 16):  # far outliers make too many levels to count them at once
+        for i in range(len(z)):
+            digit[i] = ((z[i] - low) >> shift) & 0xFFFF
+        order = counting_sort(digit, 0x10000, order)[0]
+    return order
 
 
 @njit(cache=True, nogil=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -19,17 +20,31 @@ def _to_sortable(value):
     return value if value >= 0 else -(1 << 31) - value
 
 
-@njit(cache=True, nogil=True)
-def sort_by_cluster(xyz, labels, sizes):
+def sort_by_cluster(xyz: np.ndarray, labels: np.ndarray, sizes: np.ndarray
+                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sort points (N, 3) by cluster, then x, then y, so that their order does not affect the boxes.
+
+    Args:
+        labels: (N,) int32, 0 for points without a cluster, 1..K.
+        sizes: (K,) number of points of each cluster.
 
     Returns:
         x (M,), y (M,) float32 of the points with a cluster, and start (K + 1,) of each cluster.
     """
-    start = np.zeros(len(sizes) + 1, np.int64)
-    start[1:] = np.cumsum(sizes)
+    start = np.concatenate([[0], np.cumsum(sizes)])
+    keys = _make_keys(xyz, labels, start)
+    for begin, end in pairwise(start.tolist()):
+        keys[begin:end].sort()  # vectorized, and Numba's would take seconds to compile
+    x, y = _split_keys(keys)
+    return x, y, start
+
+
+@njit(cache=True, nogil=True)
+def _make_keys(xyz, labels, start):
+    """Return the points with a cluster by cluster, (M,) int64: x and y in one number, which sorts
+    faster than two."""
     place = start[:-1].copy()
-    keys = np.empty(start[-1], np.int64)  # x and y in one number, which sorts faster than two
+    keys = np.empty(start[-1], np.int64)
     bits = xyz.view(np.int32)
     for i in range(len(xyz)):
         k = labels[i] - 1
@@ -37,14 +52,17 @@ def sort_by_cluster(xyz, labels, sizes):
             keys[place[k]] = ((_to_sortable(np.int64(bits[i, 0])) << 32)
                               + _to_sortable(np.int64(bits[i, 1])))
             place[k] += 1
-    for k in range(len(sizes)):
-        keys[start[k]:start[k + 1]].sort()
+    return keys
+
+
+@njit(cache=True, nogil=True)
+def _split_keys(keys):
     flat = np.empty((2, len(keys)), np.int32)
     for i in range(len(keys)):
         high = (keys[i] + (1 << 31)) >> 32
         flat[0, i] = _to_sortable(high)
         flat[1, i] = _to_sortable(keys[i] - (high << 32))
-    return flat[0].view(np.float32), flat[1].view(np.float32), start
+    return flat[0].view(np.float32), flat[1].view(np.float32)
 
 
 @njit(cache=True, nogil=True)

@@ -15,6 +15,8 @@ from collections import namedtuple
 import numpy as np
 from numba import njit
 
+from lidar_perception.geometry import counting_sort
+
 LEAF_SIZE = 16    # maximum number of points of a leaf
 STACK_SIZE = 64   # maximum number of boxes waiting in a search: the levels plus one
 
@@ -314,8 +316,7 @@ def find_touching_labels(tree, label, side, reach2, max_work):
     sides = np.empty((2, 2 * tree.leaves), np.int64)
     for s in range(2):
         sides[s] = _find_box_maxima(tree, reach2 + np.zeros(n), side == s)[1]
-    by_label = np.argsort(label, kind="mergesort")
-    start = np.searchsorted(label[by_label], np.arange(label.max() + 2))
+    by_label, start = counting_sort(label, label.max() + 1, np.arange(n))
     leaf, pairs, count = _find_leaves(tree), np.empty((len(start), 2), np.int64), 0
     done, stack, work = np.zeros(len(start), np.bool_), np.empty(STACK_SIZE, np.int64), 0
     queue = np.empty(n, np.int64)

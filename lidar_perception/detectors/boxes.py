@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from lidar_perception.classes import CAR
-from lidar_perception.geometry import points_in_boxes, wrap_angle, wrap_line
+from lidar_perception.geometry import points_in_boxes, quantile, wrap_angle, wrap_line
 
 MARGIN_M = 0.4          # points up to this distance from a box belong to it
 MIN_HEIGHT_M = 0.2      # lower points of a box are not used
@@ -91,7 +91,7 @@ def _move_to_points(boxes, points, first, share):
             face = flat[np.abs(flat[:, 1 - axis]) <= boxes[k, 4 - axis] / 2 + 0.1]
             if len(face) < MIN_FACE_POINTS:
                 continue
-            depth = np.quantile(half - side * face[:, axis], FACE_QUANTILE)
+            depth = quantile(half - side * face[:, axis], FACE_QUANTILE)
             expected = SIDE if axis == 1 else (FRONT if side > 0 else REAR)
             offset = -side * share * min(max(depth - expected, -MARGIN_M), MARGIN_M)
             moved[k, 0] += offset * (cos if axis == 0 else -sin)

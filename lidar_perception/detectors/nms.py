@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from lidar_perception.detectors.params import NmsParams
-from lidar_perception.geometry import MAX_CORNERS, footprint_radii, overlap_area
+from lidar_perception.geometry import MAX_CORNERS, footprint_radii, lower_bound, overlap_area
 from lidar_perception.types import CLASSES, Detections
 
 
@@ -37,15 +37,14 @@ def rotated_nms(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: 
     order = np.argsort(-scores, kind="stable")
     group = np.zeros(len(order), np.int64) if across_classes else np.asarray(labels)[order]
     ordered = np.asarray(boxes, np.float64).reshape(-1, 7)[order]
-    return order[_is_kept(ordered, group, iou)]
+    return order[_is_kept(ordered, group, iou, np.argsort(ordered[:, 0]))]
 
 
 @njit(cache=True, nogil=True)
-def _is_kept(boxes, group, iou):
+def _is_kept(boxes, group, iou, by_x):
     kept = np.ones(len(boxes), np.bool_)
     reach, work = footprint_radii(boxes), np.empty((4, MAX_CORNERS))
     area = boxes[:, 3] * boxes[:, 4]
-    by_x = np.argsort(boxes[:, 0])
     x, max_reach = boxes[by_x, 0], 0.0
     for r in reach:
         if r > max_reach:  # not NaN, as of boxes that overlap nothing
@@ -54,7 +53,7 @@ def _is_kept(boxes, group, iou):
         if not kept[i] or not reach[i] > 0:
             continue
         far = reach[i] + max_reach
-        for place in range(np.searchsorted(x, boxes[i, 0] - far), len(x)):
+        for place in range(lower_bound(x, boxes[i, 0] - far), len(x)):
             if x[place] > boxes[i, 0] + far:
                 break
             j = by_x[place]

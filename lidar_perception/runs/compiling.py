@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import fcntl
 import os
+import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
@@ -116,6 +118,33 @@ def _is_cached() -> bool:
         return True
     indices = Path(function.stats.cache_path).glob(f"{source.stem}.{function.__name__}-*.nbi")
     return any(index.stat().st_mtime >= source.stat().st_mtime for index in indices)
+
+
+@contextmanager
+def compile_meanwhile(code: str, log: Path, report: Callable[[str], object]) -> Iterator[None]:
+    """Run Python code in a second process during the block if nothing is compiled yet.
+
+    The end of the block waits for the process. Its errors are not raised: this process, which runs
+    the same code later, raises them.
+
+    Args:
+        code: what compiles, for example by opening a detector.
+        log: file for its output.
+        report: called with a line if the process outlasts the block.
+    """
+    if _is_cached():
+        yield
+        return
+    with open(log, "w") as output:
+        process = subprocess.Popen([sys.executable, "-c", code], stdout=output, stderr=output)
+        try:
+            yield
+            if process.poll() is None:
+                report(f"{COMPILING}; see {log}")
+            process.wait()
+        finally:
+            process.kill()
+            process.wait()
 
 
 @contextmanager

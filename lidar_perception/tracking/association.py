@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from scipy.optimize import linear_sum_assignment
 
-from lidar_perception.geometry import MAX_CORNERS, footprint_radii, overlap_area
+from lidar_perception.geometry import MAX_CORNERS, footprint_radii, lower_bound, overlap_area
 from lidar_perception.tracking.params import NOMINAL_PERIOD_S, AssociationParams
 
 FORBIDDEN = 1e5  # more than all allowed pairs cost together
@@ -77,7 +77,7 @@ def _find_pairs_in_gates(tracks, gate, boxes, order, with_iou):
         a = tracks[track]
         # Slightly wider, so that rounding loses no pair at the gate.
         margin = gate[track] + 1e-9 * (abs(a[0]) + gate[track])
-        for place in range(np.searchsorted(x, a[0] - margin), len(x)):
+        for place in range(lower_bound(x, a[0] - margin), len(x)):
             if x[place] > a[0] + margin:
                 break
             b = boxes[order[place]]
