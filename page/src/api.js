@@ -31,6 +31,20 @@ async function request(path, options) {
 export const getJson = async (path) => (await request(path)).json();
 export const getBytes = async (path) => (await request(path)).arrayBuffer();
 
+/** load(frame), once for the last `limit` frames; a failed request can be repeated. */
+export function cached(load, limit) {
+  const cache = new Map(); // frame -> promise, in order of last use
+  const get = (frame) => {
+    const reply = cache.get(frame) ?? load(frame);
+    cache.delete(frame);
+    cache.set(frame, reply);
+    reply.catch(() => { if (cache.get(frame) === reply) cache.delete(frame); });
+    if (cache.size > limit) cache.delete(cache.keys().next().value);
+    return reply;
+  };
+  return { get, delete: (frame) => cache.delete(frame), clear: () => cache.clear() };
+}
+
 const post = async (path, content) => (await request(path, {
   method: "POST",
   headers: { "Content-Type": "application/json", "X-Page": PAGE },

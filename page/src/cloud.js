@@ -1,6 +1,6 @@
 // Clouds: loading, caching, prefetching; and moving to another frame.
 
-import { getBytes } from "./api.js";
+import { cached, getBytes } from "./api.js";
 import { sayError } from "./messages.js";
 import { resultsOf } from "./results.js";
 import { changed, emit, store } from "./store.js";
@@ -11,10 +11,11 @@ const MAX_WAIT_MS = 120; // for results, so that they appear with their cloud
 const EMPTY = { count: 0, xyz: new Float32Array(), intensity: new Uint8Array(),
                 ground: new Uint8Array(), cluster: new Uint32Array(), floor: -1.7 };
 
-const cache = new Map(); // frame -> promise of a cloud, in order of last use
+const clouds = cached(async (frame) => parse(await getBytes(`/api/cloud/${frame}`)), MAX_CACHED);
+export const cloudOf = clouds.get;
 
 /** Make a cloud from the bytes of /api/cloud, without copying. */
-export function parse(buffer) {
+function parse(buffer) {
   const magic = String.fromCharCode(...new Uint8Array(buffer, 0, 4));
   if (magic !== "LPC1") throw new Error("the server sent an invalid cloud");
   const count = new DataView(buffer).getUint32(4, true);
@@ -43,18 +44,6 @@ function floorOf({ xyz, ground, count }) {
   }
   heights.sort((a, b) => a - b);
   return heights[heights.length >> 1];
-}
-
-export function cloudOf(frame) {
-  let cloud = cache.get(frame);
-  cache.delete(frame);
-  if (!cloud) {
-    cloud = getBytes(`/api/cloud/${frame}`).then(parse);
-    cloud.catch(() => cache.delete(frame));
-  }
-  cache.set(frame, cloud);
-  if (cache.size > MAX_CACHED) cache.delete(cache.keys().next().value);
-  return cloud;
 }
 
 /** Show a frame once its cloud is loaded; the last request wins. Emits "leaving-frame" first. */

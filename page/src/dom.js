@@ -51,3 +51,16 @@ export function icon(name) {
   return svg("svg", { viewBox: "0 0 24 24", class: "icon", "aria-hidden": "true" },
     svg("path", { d: PATHS[name] }));
 }
+
+/** A function that calls `work` before the next drawing, once however often it is called. */
+export function beforeDrawing(work) {
+  let requested = false;
+  return () => {
+    if (requested) return;
+    requested = true;
+    requestAnimationFrame(() => {
+      requested = false;
+      work();
+    });
+  };
+}

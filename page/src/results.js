@@ -1,6 +1,6 @@
 // Labels and detections of a frame, with missed and false ones.
 
-import { getJson } from "./api.js";
+import { cached, getJson } from "./api.js";
 import { colourOfClass } from "./colours.js";
 import { sayError } from "./messages.js";
 import { changed, on, store } from "./store.js";
@@ -9,8 +9,9 @@ export const MISSED = "#ff4d5e", FALSE = "#ffb020";
 const SOURCES = ["#22c1a6", "#a78bfa", "#38bdf8", "#f472b6", "#a3e635", "#fb923c"];
 const LABEL = "#94a3b8";
 
-const cache = new Map(); // frame -> promise
 const MAX_CACHED = 300, NOTHING = { labels: [], detections: {}, matches: {} };
+const cache = cached((frame) => getJson(`/api/labels/${frame}?score=${store.minScore}`), MAX_CACHED);
+export const resultsOf = cache.get;
 
 /** Boxes of labels and detections in the frame shown: {box, colour, strong, text, chosen}, and their
  * origin: {frame, layer, k, row, wrong}. */
@@ -70,17 +71,6 @@ export function resultCounts() {
            hits: match ? labels.length - missed - ignoredLabels : null,
            found: (detections[source] ?? []).filter((row) => row[8] >= store.minScore).length,
            false: match?.false?.length ?? null, ignored: match?.ignored?.length ?? null };
-}
-
-/** The results of a frame, requested from the server once. */
-export function resultsOf(frame) {
-  if (!cache.has(frame)) {
-    const reply = getJson(`/api/labels/${frame}?score=${store.minScore}`);
-    reply.catch(() => cache.delete(frame));
-    cache.set(frame, reply);
-    if (cache.size > MAX_CACHED) cache.delete(cache.keys().next().value);
-  }
-  return cache.get(frame);
 }
 
 /** Load the results of the frame shown, and never show those of another one. */

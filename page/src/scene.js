@@ -3,6 +3,7 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { theme } from "./colours.js";
+import { beforeDrawing } from "./dom.js";
 import { markPoints, openPoints, pointCount, render, setPointSize, setPoints, thinTo } from "./points.js";
 import { on, selectedBox, store } from "./store.js";
 
@@ -43,21 +44,16 @@ function drawsInSoftware() {
 export const afterDrawing = [];
 export const drawn = { ms: 0, pictures: 0, points: 0 }; // the last drawing, for measurements
 
-let asked = false, resting = 0, still = true;
+let resting = 0, still = true;
 
-export function draw() {
-  if (asked) return;
-  asked = true;
-  requestAnimationFrame(() => {
-    asked = false;
-    const start = performance.now();
-    render(renderer, scene, camera, software && still && !store.playing);
-    for (const then of afterDrawing) then();
-    drawn.ms = performance.now() - start;
-    drawn.pictures += 1;
-    drawn.points = pointCount();
-  });
-}
+export const draw = beforeDrawing(() => {
+  const start = performance.now();
+  render(renderer, scene, camera, software && still && !store.playing);
+  for (const then of afterDrawing) then();
+  drawn.ms = performance.now() - start;
+  drawn.pictures += 1;
+  drawn.points = pointCount();
+});
 
 function moving() {
   if (still) thin(true);

@@ -3,7 +3,7 @@
 
 import { moveFace, moveAlong, toLocal, turnBy } from "./boxmath.js";
 import { theme } from "./colours.js";
-import { element, svg } from "./dom.js";
+import { beforeDrawing, element, svg } from "./dom.js";
 import { setDraft } from "./edits.js";
 import { startDrag } from "./overlay.js";
 import { on, selectedBox, store } from "./store.js";
@@ -174,24 +174,18 @@ function sizes(view, box) {
   return `${box[3 + view.right].toFixed(2)} × ${box[3 + view.up].toFixed(2)} m`;
 }
 
-let asked = false;
-function redraw() {
-  if (asked) return;
-  asked = true;
-  requestAnimationFrame(() => {
-    asked = false;
-    const box = selectedBox()?.box ?? null;
-    if (box && !store.draft && !same(anchor, box)) {
-      anchor = box.slice();
-      gather();
-    }
-    const shown = anchor ? box : null, isIn = shown ? within(shown) : [];
-    for (const view of VIEWS) {
-      view.panel.classList.toggle("empty", !box);
-      drawView(view, shown, isIn);
-    }
-  });
-}
+const redraw = beforeDrawing(() => {
+  const box = selectedBox()?.box ?? null;
+  if (box && !store.draft && !same(anchor, box)) {
+    anchor = box.slice();
+    gather();
+  }
+  const shown = anchor ? box : null, isIn = shown ? within(shown) : [];
+  for (const view of VIEWS) {
+    view.panel.classList.toggle("empty", !box);
+    drawView(view, shown, isIn);
+  }
+});
 
 const same = (a, b) => a !== null && a.every((value, k) => value === b[k]);
 

@@ -2,6 +2,7 @@
 
 import { colourOfClass, theme } from "./colours.js";
 import { goTo } from "./cloud.js";
+import { beforeDrawing } from "./dom.js";
 import { to } from "./playback.js";
 import { checkFrame } from "./edits.js";
 import { on, select, store } from "./store.js";
@@ -20,12 +21,7 @@ const cell = () => (box.clientWidth - NAMES - 6) / Math.max(1, frames());
 const left = (frame) => NAMES + (frame - first()) * cell();
 const rows = () => store.shownTracks;
 
-let asked = false;
-function redraw() {
-  if (asked || !store.drive) return;
-  asked = true;
-  requestAnimationFrame(() => { asked = false; paint(); });
-}
+const redraw = beforeDrawing(() => { if (store.drive) paint(); });
 
 function paint() {
   const ratio = Math.min(devicePixelRatio, 2), width = box.clientWidth, height = box.clientHeight;
