@@ -357,3 +357,13 @@ def test_importing_a_module_does_not_load_what_it_does_not_need(cases):
     result = subprocess.run([sys.executable, "-c", IMPORTING, *map(" ".join, cases)], cwd=ROOT,
                             capture_output=True, text=True, check=True)
     assert result.stdout == ""
+
+
+def test_test_files_import_no_other_test_file():
+    """What they share is in test/support or in a conftest.py."""
+    for path in sorted((ROOT / "test").rglob("*.py")):
+        imported = {name.split(".")[-1] for node in ast.walk(ast.parse(path.read_text()))
+                    for name in ([node.module or ""] if isinstance(node, ast.ImportFrom)
+                                 else [a.name for a in node.names] if isinstance(node, ast.Import)
+                                 else [])}
+        assert not [name for name in imported if name.startswith("test_")], path

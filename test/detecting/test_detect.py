@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from bag_samples import cloud_frame, scans
 from cli_samples import evaluate_detection
-from detect_samples import NAME, MadeDetector, detect, objects, read_json, refused
+from detect_samples import NAME, MadeDetector, detect, make_run, objects, read_json, refused
 from kitti_samples import tracking_folder
 from PIL import Image
 from recording_samples import MADE
@@ -29,9 +29,7 @@ from lidar_perception.data.kitti.results import (
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detecting.bag import Bag as BagFormat
-from lidar_perception.detecting.formats import Json, Run
-from lidar_perception.detecting.pictures import FrameDrawer
-from lidar_perception.detecting.results import FrameResult
+from lidar_perception.detecting.formats import Json
 from lidar_perception.detecting.run import detect as run_detector
 from lidar_perception.detectors import open as opening
 from lidar_perception.detectors.contract import DetectionResult
@@ -157,17 +155,10 @@ def test_a_bag_of_a_cloud_that_has_its_stamp_twice_is_written_without_labels(tmp
     """Nothing would say whose the labels are."""
     frames = [replace(frame, stamp_ns=STAMP) for frame in scans(3)]
     recording = Recording(tmp_path, "", frames)
-    run = made_run(recording, tmp_path / "out")
+    run = make_run(recording, tmp_path / "out")
     run_detector(run, MadeDetector, [partial(BagFormat, clouds=True, tracked=False)])
     with Bag(tmp_path / "out/bag") as bag:
         assert bag.counts[POINTS] == 3 and bag.counts[TRUTH] == 1
-
-
-def made_run(recording, out, **header):
-    return Run(recording, out, {"detector": NAME, "min_scores": {}, **header}, len(recording))
-
-
-# Results are scored as the detector is
 
 
 @pytest.mark.parametrize("camera", [True, False], ids=["camera", "nominal"])
@@ -269,7 +260,7 @@ def test_a_run_that_was_stopped_is_resumed(drives, tmp_path, made):
         if len(made) == 3:
             raise Stopped
     recording = open_recording(drives)
-    whole, parts = (made_run(recording, tmp_path / name) for name in ("whole", "parts"))
+    whole, parts = (make_run(recording, tmp_path / name) for name in ("whole", "parts"))
     run_detector(whole, MadeDetector, [Json], tracking=TrackingParams(), ego="none")
     made.clear()
     with pytest.raises(Stopped):
@@ -284,7 +275,7 @@ def test_a_run_that_was_stopped_is_resumed(drives, tmp_path, made):
 def test_the_number_of_processes_does_not_change_the_result(drives, tmp_path):
     recording = open_recording(drives)
     for name, jobs in ("one", 1), ("two", 2):
-        run_detector(made_run(recording, tmp_path / name), MadeDetector, [Json],
+        run_detector(make_run(recording, tmp_path / name), MadeDetector, [Json],
                      tracking=TrackingParams(), ego="none", jobs=jobs)
     assert read_json(tmp_path / "one") == read_json(tmp_path / "two")
 
@@ -397,15 +388,3 @@ def test_a_film_that_cannot_be_made_is_refused_before_any_work(drives, tmp_path,
                        tmp_path / name)
         assert words in line
     assert made == [] and not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("stamp, timed, expected", [
-    (STAMP, True, "2023-11-14 22:13:20.123 UTC"), (STAMP, False, "1.5 s"),
-    (7 * 10**9, True, "1.5 s")])
-def test_pictures_say_when_they_are(stamp, timed, expected, tmp_path):
-    frames = [Frame.of(str(i), cloud_frame(scene(i), stamp + i * 10**9 - 15 * 10**8))
-              for i in range(2)]
-    run = made_run(Recording(tmp_path / "drive", "", frames, has_times=timed), tmp_path / "out")
-    drawer = FrameDrawer(run)
-    drawer.get_stage(FrameResult(frames[0], Detections.none(), "velodyne", 1.0))
-    assert drawer.time(stamp) == expected

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,14 +15,13 @@ from mcap.reader import make_reader
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import ClockType
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
-from lidar_perception.nodes.runtime import LATCHED, RELIABLE, SENSOR_DATA, WAITING
+from lidar_perception.nodes.runtime import LATCHED, WAITING
 from lidar_perception.wire.clouds import COMPRESSED, LIVOX
-from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.codec import bag_message, decode
 from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
 from msg_utils.point_cloud2 import to_array
 from msg_utils.stamps import to_ns
@@ -316,74 +314,6 @@ def test_the_recorder_writes_what_the_player_plays(processes, peer, text_bag, tm
         assert bag.qos("/note")[0].durability.name == "TRANSIENT_LOCAL"
     with open(tmp_path / "copy/copy.mcap", "rb") as stream:
         assert {c.compression for c in make_reader(stream).get_summary().chunk_indexes} == {"lz4"}
-
-
-def test_the_recorder_has_what_each_of_several_publishers_latched(processes, peer, tmp_path):
-    for i in range(6):  # as each node with a fixed sensor does on /tf_static
-        peer.advertise("/note", TEXT, LATCHED).publish(encode(bag_message(TEXT, data=str(i))))
-    processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["/note"]})
-    peer.wait(lambda: peer.get_value("bag_recorder", "frames") == "6", "six messages")
-    assert processes.stop()["bag_recorder"] == 0
-    with Bag(tmp_path / "bag") as bag:
-        assert sorted(m.data for _, _, m in bag.messages({"/note"})) == [*"012345"]
-
-
-def test_late_publisher_with_weaker_qos_is_recorded(processes, peer, tmp_path):
-    """Also by a name of the node's namespace."""
-    first = peer.advertise("/robot/text", TEXT, RELIABLE)
-    processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["text"]},
-                    namespace="robot")
-
-    def frames():
-        return int(peer.get_value("robot/bag_recorder", "frames") or 0)
-    peer.send(first, bag_message(TEXT, data="first"), frames, "the first")
-    before, later = frames(), peer.advertise("/robot/text", TEXT, SENSOR_DATA)
-    peer.send(later, bag_message(TEXT, data="later"), lambda: frames() > before, "the later one")
-    assert processes.stop()["robot.bag_recorder"] == 0
-    with Bag(tmp_path / "bag") as bag:
-        assert {m.data for _, _, m in bag.messages({"/robot/text"})} == {"first", "later"}
-
-
-def test_a_type_that_is_not_installed_ends_no_recording(monkeypatch, peer, start, tmp_path):
-    from lidar_perception.nodes.replay import bag_recorder
-    known = bag_recorder.load_message_class
-
-    def lacking(name):
-        if name == INFO:
-            raise ModuleNotFoundError
-        return known(name)
-    monkeypatch.setattr(bag_recorder, "load_message_class", lacking)
-    peer.advertise("/info", INFO)
-    peer.advertise("/text", TEXT)
-    node = start(bag_recorder.BagRecorder, bag=str(tmp_path / "bag"), topics=("/info", "/text"))
-    peer.wait(lambda: [node._discover(), not node.waiting][1], "both to be found")
-    node.close()
-    with Bag(tmp_path / "bag") as bag:
-        assert list(bag.topics) == ["/text"]
-
-
-def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tmp_path):
-    """What waits has a bound, whatever comes; the clock of a simulation may stand."""
-    from lidar_perception.nodes.replay import bag_recorder
-    monkeypatch.setattr(bag_recorder, "MAX_QUEUED", 100)
-    held = threading.Event()
-    monkeypatch.setattr(bag_recorder.BagWriter, "write", lambda *_: held.wait())
-    kept = []
-    monkeypatch.setattr(bag_recorder.BagRecorder, "create_subscription",
-                        lambda self, kind, topic, received, *_, **__: kept.append(received))
-    node = start(bag_recorder.BagRecorder, **{"bag": str(tmp_path / "bag"), "topics": ["/a"],
-                                              "use_sim_time": True})
-    node._subscribe("/a", None)
-    try:
-        for _ in range(10):
-            kept[-1](bytes(40))
-        assert node.counts["frames"] == 2 and node.counts["dropped"] == 8
-        node._discover()
-        assert "8 dropped" in node.state[1]
-    finally:
-        held.set()
-        node.close()
-    assert all(timer.clock.clock_type == ClockType.STEADY_TIME for timer in node.timers)
 
 
 def test_looped_single_message_bag_does_not_flood(

@@ -347,9 +347,8 @@ def test_the_best_score_is_the_best_of_all_scores(seed):
                         for n in rng.integers(1, 6, 2))
         scores.update(truth, found, rng.integers(0, 3, len(found)) / 2)
     assert scores.table(scores.best_score())["all"]["f1"] == pytest.approx(brute_best(scores))
-    row = scores.compute()["of_all"]["all"]
-    assert row["tp"] == sum(len(match_centres(found, truth)[0])
-                            for truth, found, _ in scores.frames)
+    assert scores.compute()["of_all"]["all"]["tp"] == sum(
+        len(match_centres(found, truth)[0]) for truth, found, _ in scores.frames)
 
 
 def test_detections_of_equal_score_are_kept_together():

@@ -1,4 +1,4 @@
-"""The command line as a test calls it."""
+"""Calls of the command line, for tests."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from lidar_perception.cli.main import cli, main
 
 
 def exit_of(monkeypatch, *arguments, run=main) -> int:
-    """The exit code of `lidar-perception ARGUMENTS`, or of another command line, in this process.
-    """
+    """Return the exit code of `lidar-perception ARGUMENTS`, run in this process."""
     monkeypatch.setattr(sys, "argv", ["lidar-perception", *map(str, arguments)])
     try:
         run()
@@ -22,8 +21,31 @@ def exit_of(monkeypatch, *arguments, run=main) -> int:
     return 0
 
 
+def run(*arguments) -> str:
+    """Return the standard output of a command that succeeds."""
+    result = CliRunner().invoke(cli, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def evaluate(tmp_path, *arguments) -> dict:
+    """Return the JSON file of `evaluate candidates`."""
+    path = tmp_path / "made/by/evaluate/scores.json"
+    run("evaluate", "candidates", "--json", path, *arguments)
+    return json.loads(path.read_text())
+
+
+def given(*assignments) -> list[str]:
+    return [word for each in assignments for word in ("--set", each)]
+
+
+def scores(content: dict) -> dict:
+    """Return the scores without the run time."""
+    return {k: v for k, v in content.items() if k != "ms"}
+
+
 def evaluate_detection(tmp_path, *arguments):
-    """The JSON file and the output of `evaluate detection`, which must succeed."""
+    """Return the JSON file and the output of `evaluate detection`."""
     path = tmp_path / "made/scores.json"
     result = CliRunner().invoke(cli, ["evaluate", "detection", "--json", str(path),
                                       *map(str, arguments)], catch_exceptions=False)
@@ -32,8 +54,10 @@ def evaluate_detection(tmp_path, *arguments):
 
 
 def error_line(capsys) -> str:
-    """The one line on stderr that says what is wrong. Before it there may be what was opened, that
-    code is compiled, and the empty line of a progress bar that ended."""
+    """Return the error line on stderr.
+
+    Lines about the opened recording and compilation, and empty lines may come before it.
+    """
     *before, line = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("Error: ")
     assert all(re.search(r": .*, \d+ frames?\b|^compiling ", each)

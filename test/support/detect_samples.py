@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from cli_samples import error_line, exit_of
 
+from lidar_perception.detecting.formats import Run
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.param_fields import Params, param
 from lidar_perception.types import CLASSES, Detections
@@ -88,3 +89,7 @@ def objects(content):
     return {frame["name"]: [[CLASSES.index(row["class"]), row["score"], *(row[name] for name in (
         "x", "y", "z", "length", "width", "height", "yaw"))] for row in frame["objects"]]
         for frame in content["frames"]}
+
+
+def make_run(recording, out, **header):
+    return Run(recording, out, {"detector": NAME, "min_scores": {}, **header}, len(recording))
