@@ -30,13 +30,13 @@ def main(part: str, minutes: float, seed: int, first: int, cases: int) -> None:
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
         attempt = module.Attempt(Path(folder))
         for number, case, outcome, used in run_cases(
-                module.case_of, attempt, seed, range(first, first + cases), PARTS[part],
+                module.make_case, attempt, seed, range(first, first + cases), PARTS[part],
                 begin + 60 * minutes):
             verdicts[outcome.verdict] += 1
             largest = max(largest, used)
             if outcome.verdict == FAILED:
-                kinds[kind_of(outcome.reason)] += 1
-                if kinds[kind_of(outcome.reason)] == 1:
+                kinds[classify_reason(outcome.reason)] += 1
+                if kinds[classify_reason(outcome.reason)] == 1:
                     print(f"{part} --seed {seed} --first {number} --cases 1: {case.name}: "
                           f"{outcome.reason}", flush=True)
     print(f"{part}: " + ", ".join(f"{verdicts[v]:,} {v}" for v in (SURVIVED, REFUSED, FAILED))
@@ -46,7 +46,7 @@ def main(part: str, minutes: float, seed: int, first: int, cases: int) -> None:
     sys.exit(verdicts[FAILED] > 0 or not verdicts)
 
 
-def kind_of(reason: str) -> str:
+def classify_reason(reason: str) -> str:
     """Return the first line of a reason without numbers, paths and quoted words."""
     return re.sub(r"'[^']*'|/\S+|-?\b\d[\w.+-]*|\bnan\b", "..", reason.partition("\n")[0])[:160]
 

@@ -30,7 +30,7 @@ class Outcome(NamedTuple):
     reason: str = ""
 
 
-def generator(part: str, seed: int, number: int) -> np.random.Generator:
+def make_generator(part: str, seed: int, number: int) -> np.random.Generator:
     """Return the random numbers of one case, the same on every machine."""
     return np.random.default_rng([zlib.crc32(part.encode()), seed, number])
 
@@ -40,7 +40,7 @@ def pick(rng: np.random.Generator, choices: Any) -> Any:
     return choices[int(rng.integers(len(choices)))]
 
 
-def run_cases(case_of: Callable[[int, int], Case], attempt: Callable[[Case], Outcome],
+def run_cases(make_case: Callable[[int, int], Case], attempt: Callable[[Case], Outcome],
               seed: int, numbers: Iterable[int], max_mb: float, deadline: float
               ) -> Iterator[tuple[int, Case, Outcome, float]]:
     """Yield number, case, outcome and megabytes of each case, until the monotonic time `deadline`.
@@ -51,8 +51,8 @@ def run_cases(case_of: Callable[[int, int], Case], attempt: Callable[[Case], Out
     for number in numbers:
         if monotonic() > deadline:
             return
-        case = case_of(seed, number)
-        before = memory_mb("VmRSS", reset=True)
+        case = make_case(seed, number)
+        before = read_memory_mb("VmRSS", reset=True)
         faulthandler.dump_traceback_later(CASE_SECONDS, exit=True)
         try:
             outcome = attempt(case)
@@ -62,13 +62,13 @@ def run_cases(case_of: Callable[[int, int], Case], attempt: Callable[[Case], Out
                               f"({Path(last.filename).name}:{last.lineno})")
         finally:
             faulthandler.cancel_dump_traceback_later()
-        used = max(0.0, memory_mb("VmHWM") - before)
+        used = max(0.0, read_memory_mb("VmHWM") - before)
         if used > max_mb and outcome.verdict != FAILED:
             outcome = Outcome(FAILED, f"took {used:.0f} MB, more than {max_mb:g}")
         yield number, case, outcome, used
 
 
-def memory_mb(name: str, reset: bool = False) -> float:
+def read_memory_mb(name: str, reset: bool = False) -> float:
     """Return the memory of this process in MB by its name in /proc: VmRSS is the present value,
     VmHWM the highest since the last reset. 0 where there is no /proc."""
     try:

@@ -19,7 +19,7 @@ from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.wire.codec import bag_message
 
 
-def command_outcome(code: int | None, out: str, errors: str) -> Outcome:
+def judge_command(code: int | None, out: str, errors: str) -> Outcome:
     """Judge a command: it must give a result, or one line with the reason. code: its exit code,
     minus the signal that ended it, or None if it took too long."""
     lines = [line for line in errors.splitlines() if line.strip()]
@@ -32,9 +32,9 @@ def command_outcome(code: int | None, out: str, errors: str) -> Outcome:
         return Outcome(FAILED, f"traceback: {last}")
     if code == 0:
         return Outcome(SURVIVED)
-    said = [line for line in out.splitlines() if line.strip()] or lines
-    if code == 1 and said:
-        return Outcome(REFUSED, f"exit code 1: {said[-1]}")
+    output_lines = [line for line in out.splitlines() if line.strip()] or lines
+    if code == 1 and output_lines:
+        return Outcome(REFUSED, f"exit code 1: {output_lines[-1]}")
     if code == 2 and last.startswith("Error: "):
         return Outcome(REFUSED, last.removeprefix("Error: "))
     return Outcome(FAILED, f"exit code {code} without one line that says why: {last}")
@@ -56,23 +56,23 @@ def run_command(arguments: list[str], folder: Path, seconds: float, max_mb: floa
     texts = [folder / f".output.{name}" for name in ("out", "errors")]
     child = os.fork()
     if child == 0:
-        _become(arguments, folder, texts)
+        _exec_command(arguments, folder, texts)
     end, pid = monotonic() + seconds, 0
     while not pid:
         pid, status, usage = os.wait4(child, os.WNOHANG)
         if not pid and monotonic() > end:
             os.kill(child, signal.SIGKILL)
             os.wait4(child, 0)
-            return command_outcome(None, "", "")
+            return judge_command(None, "", "")
         sleep(0 if pid else 0.01)
-    outcome = command_outcome(os.waitstatus_to_exitcode(status), *(
+    outcome = judge_command(os.waitstatus_to_exitcode(status), *(
         text.read_text(errors="replace") for text in texts))
     if (used := usage.ru_maxrss / 1024) > max_mb:
         return Outcome(FAILED, f"the command took {used:.0f} MB, more than {max_mb:g}")
     return outcome
 
 
-def _become(arguments: list[str], folder: Path, texts: list[Path]) -> None:
+def _exec_command(arguments: list[str], folder: Path, texts: list[Path]) -> None:
     code = 70
     try:
         for number, text in enumerate(texts, 1):

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from fuzz.case import Case, Outcome, generator, pick
+from fuzz.case import Case, Outcome, make_generator, pick
 from fuzz.command import load_all, run_command
 from fuzz.mutation import mutate_bytes, mutate_text
 
@@ -58,7 +58,7 @@ INSTEAD: dict[str, Callable[[Path], object]] = {
 
 
 @functools.cache
-def samples() -> dict[str, bytes]:
+def load_samples() -> dict[str, bytes]:
     """Return the bytes of every valid file by its path."""
     with tempfile.TemporaryDirectory() as folder:
         # In another process, because threads that torch starts here would be missing in forks.
@@ -67,13 +67,13 @@ def samples() -> dict[str, bytes]:
                 for path in sorted(Path(folder).rglob("*")) if path.is_file()}
 
 
-def case_of(seed: int, number: int) -> Case:
+def make_case(seed: int, number: int) -> Case:
     """Return a case with one damaged file of one format, and a command that reads it."""
-    rng = generator("files", seed, number)
+    rng = make_generator("files", seed, number)
     names = [name for name, (weight, _) in COMMANDS.items() for _ in range(int(weight))]
     name = pick(rng, names)
-    path, instead = pick(rng, [path for path in samples() if path.startswith(f"{name}/")]), ""
-    data = samples()[path]
+    path, instead = pick(rng, [path for path in load_samples() if path.startswith(f"{name}/")]), ""
+    data = load_samples()[path]
     if rng.random() < 0.05:
         instead = what = pick(rng, list(INSTEAD))
     elif path.endswith(TEXT) and rng.random() < 0.8:
@@ -90,7 +90,7 @@ class Attempt:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        for path, data in samples().items():
+        for path, data in load_samples().items():
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             (folder / path).write_bytes(data)
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
@@ -105,7 +105,7 @@ class Attempt:
             return run_command(command, self.folder, SECONDS, MEGABYTES)
         finally:
             _remove(path)
-            path.write_bytes(samples()[name])
+            path.write_bytes(load_samples()[name])
             for made in self.folder.glob("made*"):
                 _remove(made)
 

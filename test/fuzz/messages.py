@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from fuzz.case import Case, Outcome, generator, pick
+from fuzz.case import Case, Outcome, make_generator, pick
 from fuzz.mutation import mutate_bytes
 from fuzz.nodes import INPUTS, Nodes, draw_node
-from fuzz.valid_messages import mutated
+from fuzz.valid_messages import mutate_valid_message
 
 
-def case_of(seed: int, number: int) -> Case:
+def make_case(seed: int, number: int) -> Case:
     """Return a case with one message for one input of one node."""
-    rng = generator("messages", seed, number)
+    rng = make_generator("messages", seed, number)
     node = draw_node(rng)
     _, inputs, variants = INPUTS[node]
     topic = "input/points" if "input/points" in inputs and rng.random() < 0.7 else pick(
         rng, list(inputs))
-    data, change = mutated(inputs[topic], rng)
+    data, change = mutate_valid_message(inputs[topic], rng)
     if rng.random() < 0.1:
         data, damage = mutate_bytes(data, rng)
         change += f"; {damage}"

@@ -27,12 +27,12 @@ def mutate_bytes(data: bytes, rng: np.random.Generator) -> tuple[bytes, str]:
     anywhere, or near either end, where headers and indices are."""
     changes = []
     for _ in range(int(rng.integers(1, 4))):
-        data, change = _one_change(data, rng)
+        data, change = _change_bytes(data, rng)
         changes.append(change)
     return data, ", ".join(changes)
 
 
-def _one_change(data: bytes, rng: np.random.Generator) -> tuple[bytes, str]:
+def _change_bytes(data: bytes, rng: np.random.Generator) -> tuple[bytes, str]:
     size = len(data)
     low, high = pick(rng, ((0, size), (0, size), (0, min(size, 512)), (max(0, size - 4096), size)))
     at = int(rng.integers(low, high + 1))
@@ -99,17 +99,17 @@ def mutate_message(message: Any, rng: np.random.Generator) -> str:
     if node == Nodetype.NAME:
         return f"{name}.{mutate_message(value, rng)}"
     if node == Nodetype.BASE:
-        setattr(message, name, _value(detail[0], rng))
+        setattr(message, name, _draw_value(detail[0], rng))
         return f"{name} = {str(getattr(message, name))[:20]}"
     element = detail[0]
     if element[0] == Nodetype.BASE and element[1][0] != "string":
-        changed, what = _array(value, rng, fixed=node == Nodetype.ARRAY)
+        changed, what = _change_array(value, rng, fixed=node == Nodetype.ARRAY)
         setattr(message, name, changed)
         return f"{name}: {what}"
-    return f"{name}: {_list(message, name, element, rng)}"
+    return f"{name}: {_change_list(message, name, element, rng)}"
 
 
-def _value(kind: str, rng: np.random.Generator) -> Any:
+def _draw_value(kind: str, rng: np.random.Generator) -> Any:
     if kind == "string":
         return pick(rng, TEXTS)
     if kind == "bool":
@@ -122,7 +122,8 @@ def _value(kind: str, rng: np.random.Generator) -> Any:
     return int(min(max(number, limits.min), limits.max))
 
 
-def _array(values: np.ndarray, rng: np.random.Generator, fixed: bool) -> tuple[np.ndarray, str]:
+def _change_array(values: np.ndarray, rng: np.random.Generator, fixed: bool
+                  ) -> tuple[np.ndarray, str]:
     values = np.array(values)
     if not fixed and rng.random() < 0.5:
         size = int(rng.integers(0, 2 * len(values) + 2))
@@ -130,12 +131,12 @@ def _array(values: np.ndarray, rng: np.random.Generator, fixed: bool) -> tuple[n
             f"{size} values of {len(values)}"
     if len(values):
         at = int(rng.integers(len(values)))
-        values[at] = _value(values.dtype.name, rng)
+        values[at] = _draw_value(values.dtype.name, rng)
         return values, f"[{at}] = {values[at]}"
     return values, "none"
 
 
-def _list(message: Any, name: str, element: tuple, rng: np.random.Generator) -> str:
+def _change_list(message: Any, name: str, element: tuple, rng: np.random.Generator) -> str:
     items = list(getattr(message, name))
     kind = what = pick(rng, ("inside", "inside", "drop", "double", "new"))
     if kind == "new" or not items:

@@ -11,7 +11,7 @@ import numpy as np
 from rclpy.logging import LoggingSeverity, set_logger_level
 
 from fuzz.case import FAILED, REFUSED, SURVIVED, Outcome
-from fuzz.valid_messages import CLOUD, valid_message
+from fuzz.valid_messages import CLOUD, make_valid_message
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes import load_node_class
 from lidar_perception.nodes.external_node import Context, create_context, to_parameters
@@ -109,7 +109,7 @@ class FedNode:
             self.params = params
         for other in self.inputs:
             if other not in (topic, "input/points"):
-                self.calls[other](valid_message(self.inputs[other]))
+                self.calls[other](make_valid_message(self.inputs[other]))
         states = [self.deliver(topic, data)]
         if then_valid:
             states += self.deliver_valid(topic)
@@ -130,7 +130,7 @@ class FedNode:
 
     def deliver_valid(self, *first: str) -> list[tuple[bytes, str]]:
         """Deliver a valid message to some inputs, then to all, the cloud last."""
-        return [self.deliver(t, valid_message(self.inputs[t])) for t in [
+        return [self.deliver(t, make_valid_message(self.inputs[t])) for t in [
             *first, *sorted(self.inputs, key=lambda t: t == "input/points")]]
 
     def judge(self, states: list[tuple[bytes, str]]) -> Outcome:

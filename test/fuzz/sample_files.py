@@ -14,7 +14,7 @@ import nuscenes_folder
 from bag_samples import as_ros1
 
 from fuzz.files import LABELS
-from fuzz.valid_messages import PERSON, STAMP, street
+from fuzz.valid_messages import PERSON, STAMP, make_points
 from lidar_perception.candidates.configurations import BEST_VALUES
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti import write as kitti
@@ -36,7 +36,7 @@ TRUTH = GroundTruth.of([PERSON, CAR], [PEDESTRIAN, 0], [
 
 def scan(number: int) -> np.ndarray:
     """Return points (N, 4) float32 [x y z intensity]."""
-    xyz = street(number)
+    xyz = make_points(number)
     return np.column_stack([xyz, np.full(len(xyz), 0.4)]).astype(np.float32)
 
 
@@ -45,8 +45,9 @@ def write_samples(root: Path) -> None:
     for i in range(FRAMES):
         kitti.write_object(root / "kitti", i, scan(i), TRUTH, FORWARD_CAMERA)
         kitti.write_velodyne(root / f"tracking/training/velodyne/0000/{i:06}.bin", scan(i))
+        count = len(make_points(i))
         write_scan(root / "semantickitti/sequences/00", i, scan(i),
-                   np.full(len(street(i)), 40, np.uint32), np.zeros(len(street(i)), np.uint32))
+                   np.full(count, 40, np.uint32), np.zeros(count, np.uint32))
     tracking = root / "tracking/training"
     write_text(tracking / "label_02/0000.txt", "".join(
         kitti.format_tracking_labels(i, TRUTH, FORWARD_CAMERA) for i in range(FRAMES)).strip())
@@ -56,8 +57,8 @@ def write_samples(root: Path) -> None:
     write_text(sequence / "times.txt", "0.0\n0.1")
     write_text(sequence / "calib.txt", format_calibration(FORWARD_CAMERA))
     write_bag(root / "bag/drive", [Frame.of(str(i), PointCloud(
-        street(i), np.full(len(street(i)), 0.4, np.float32), STAMP + i * 10**8, "lidar"), TRUTH,
-        FORWARD_CAMERA, pose=lambda: np.eye(4)) for i in range(FRAMES)])
+        make_points(i), np.full(len(make_points(i)), 0.4, np.float32), STAMP + i * 10**8, "lidar"),
+        TRUTH, FORWARD_CAMERA, pose=lambda: np.eye(4)) for i in range(FRAMES)])
     drive = open_recording(root / "bag/drive").frames
     for format, place in LABELS.items():
         export_labels(DriveLabels(list(map(read_frame_labels, drive))), format, root / place, drive)
@@ -65,7 +66,7 @@ def write_samples(root: Path) -> None:
         "VERSION 0.7", "FIELDS x y z intensity", "SIZE 4 4 4 4", "TYPE F F F F", "COUNT 1 1 1 1",
         "WIDTH 20", "HEIGHT 1", "POINTS 20", "DATA ascii",
         *(" ".join(map(str, point)) for point in scan(0)[:20].tolist())]))
-    _write_foreign(root)
+    _write_other_layouts(root)
     (root / "ros1").mkdir()
     as_ros1(root / "bag/drive", root / "ros1/drive.bag", "lz4")
     nuscenes_folder.save(root / "nuscenes", nuscenes_folder.make_tables(
@@ -80,17 +81,17 @@ def write_samples(root: Path) -> None:
                 (package / "candidates/pedestrian.json").read_bytes())
     write_bytes(root / "fused/fused.json", (
         package / "detectors/fused/fusion.json").read_bytes())
-    write_text(root / "yaml/best.yaml", _yaml(BEST_VALUES))
+    write_text(root / "yaml/best.yaml", _write_yaml(BEST_VALUES))
     write_bytes(root / "sensor/mine.yaml", (
         package / "simulation/sensors/vlp-16.yaml").read_bytes())
     for name in ("pointpillars_v0_compact", "pointnet"):
         write_bytes(root / f"weights/{name}.safetensors", (
             package / f"detectors/{name.partition('_')[0]}/weights/{name}.safetensors"
         ).read_bytes())
-    write_bytes(root / "pth/weights.pth", _pth())
+    write_bytes(root / "pth/weights.pth", _make_pth())
 
 
-def _write_foreign(root: Path) -> None:
+def _write_other_layouts(root: Path) -> None:
     """Write clouds and labels in the layouts of other tools."""
     cloud = scan(0)[:200]
     for folder in ("npy", "openpcdet/points", "ply"):
@@ -116,12 +117,12 @@ def _write_foreign(root: Path) -> None:
         "<rz>0.3</rz></item></poses></item></tracklets></boost_serialization>"))
 
 
-def _yaml(values: dict[str, Any]) -> str:
+def _write_yaml(values: dict[str, Any]) -> str:
     lines = [f"    {name}: {json.dumps(value)}" for name, value in values.items()]
     return "\n".join(["perception:", "  ros__parameters:", *lines])
 
 
-def _pth() -> bytes:
+def _make_pth() -> bytes:
     """Return a file in OpenPCDet's form with a few tensors."""
     import torch
     stream = io.BytesIO()

@@ -15,10 +15,10 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 from detection_samples import lively, tiny
 
 from fuzz import files, messages, mutation, parameters
-from fuzz.case import FAILED, REFUSED, SURVIVED, Case, Outcome, memory_mb, run_cases
-from fuzz.command import command_outcome
+from fuzz.case import FAILED, REFUSED, SURVIVED, Case, Outcome, read_memory_mb, run_cases
+from fuzz.command import judge_command
 from fuzz.nodes import INPUTS, FedNode
-from fuzz.valid_messages import CLOUD, cloud, mutated, valid_message
+from fuzz.valid_messages import CLOUD, make_cloud, make_valid_message, mutate_valid_message
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.external_node import create_context, shut_down_context
@@ -60,7 +60,7 @@ def test_every_input_of_a_node_is_fuzzed(nodes):
 def test_nodes_survive_or_refuse_each_case(part, cases, nodes, tmp_path):
     attempt = part.Attempt(tmp_path, nodes)
     outcomes = [outcome for _, _, outcome, _ in run_cases(
-        part.case_of, attempt, 1, range(cases), 500.0, np.inf)]
+        part.make_case, attempt, 1, range(cases), 500.0, np.inf)]
     assert [outcome for outcome in outcomes if outcome.verdict == FAILED] == []
     assert len(outcomes) == cases
     assert min(sum(o.verdict == v for o in outcomes) for v in (SURVIVED, REFUSED)) >= cases // 10
@@ -82,7 +82,7 @@ def test_node_warns_about_curves_of_other_weights(nodes):
 @pytest.mark.no_cover
 @pytest.mark.parametrize("name", WITH_CLOUDS)
 def test_extreme_columns_cost_no_memory(nodes, name):
-    plain, node, params = cloud("columns"), nodes[name], INPUTS[name][2][0]
+    plain, node, params = make_cloud("columns"), nodes[name], INPUTS[name][2][0]
     turn = np.arange(len(to_array(plain))) % 7
     assert node.attempt("input/points", encode(plain), params, False).reason == ""
     for column in COLUMNS:
@@ -91,11 +91,11 @@ def test_extreme_columns_cost_no_memory(nodes, name):
             for values in (np.where(turn < 7, largest, 0),
                            np.choose(turn, [1, largest, least, odd, largest, 0, 1])):
                 data = encode(add_columns(plain, bag_message, **{column: values.astype(kind)}))
-                before = memory_mb("VmRSS", reset=True)
+                before = read_memory_mb("VmRSS", reset=True)
                 outcome = node.attempt("input/points", data, params, False)
                 case = column, kind, values[:7].tolist(), outcome.reason
                 assert outcome.verdict != FAILED, case
-                assert memory_mb("VmHWM") - before < 64, case  # a byte for each id up to 2^31: 2048
+                assert read_memory_mb("VmHWM") - before < 64, case  # a byte per id: 2048
     assert node.attempt("input/points", data, params, True).verdict != FAILED
 
 
@@ -103,7 +103,7 @@ def test_extreme_columns_cost_no_memory(nodes, name):
     ("ground", {"clustering"}), ("in_view", set(WITH_CLOUDS)),
     ("cluster_id", {"candidate_refinement", "pointnet_detector"})])
 def test_column_with_count_above_1_is_refused(nodes, column, reading):
-    plain = cloud("columns")
+    plain = make_cloud("columns")
     plain.fields = [f for f in plain.fields if f.name in ("x", "y", "z", column)]
     plain.fields[-1].offset, plain.fields[-1].datatype, plain.fields[-1].count = 12, 2, 2  # uint8
     for name in WITH_CLOUDS:
@@ -115,26 +115,26 @@ def test_column_with_count_above_1_is_refused(nodes, column, reading):
 
 def test_cases_depend_on_the_seed_only(monkeypatch):
     samples = {f"{name}/a.bin": bytes(99) for name in files.COMMANDS}
-    monkeypatch.setattr(files, "samples", lambda: samples)
+    monkeypatch.setattr(files, "load_samples", lambda: samples)
     for part in (messages, files, parameters):
-        first, again, other = ([part.case_of(seed, i) for i in range(30)] for seed in (5, 5, 6))
+        first, again, other = ([part.make_case(seed, i) for i in range(30)] for seed in (5, 5, 6))
         assert first == again != other
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_mutation_changes_a_copy(seed):
-    data, rng = valid_message(CLOUD), np.random.default_rng(seed)
-    assert mutation.mutate_bytes(data, rng)[1] and data == valid_message(CLOUD)
+    data, rng = make_valid_message(CLOUD), np.random.default_rng(seed)
+    assert mutation.mutate_bytes(data, rng)[1] and data == make_valid_message(CLOUD)
     assert mutation.mutate_text("a: 1\nb: [2.5, x]\n", rng)[1]
-    assert mutated(CLOUD, rng)[0] != data == valid_message(CLOUD)
+    assert mutate_valid_message(CLOUD, rng)[0] != data == make_valid_message(CLOUD)
 
 
 def test_command_outcome_needs_result_or_reason():
-    assert command_outcome(0, "", "").verdict == SURVIVED
-    assert command_outcome(2, "", "3 frames\nError: cannot read it\n").verdict == REFUSED
-    assert command_outcome(1, "left out: a frame\n", "").verdict == REFUSED
+    assert judge_command(0, "", "").verdict == SURVIVED
+    assert judge_command(2, "", "3 frames\nError: cannot read it\n").verdict == REFUSED
+    assert judge_command(1, "left out: a frame\n", "").verdict == REFUSED
     traceback = "Traceback (most recent call last):\n\nError: x"
-    bad = [command_outcome(code, "", errors) for code, errors in (
+    bad = [judge_command(code, "", errors) for code, errors in (
         *((code, "") for code in (None, -11, 1, 2, 70)), (0, traceback), (2, traceback))]
     assert {outcome.verdict for outcome in bad} == {FAILED}
 

@@ -33,7 +33,7 @@ LAYOUTS: dict[str, Any] = {
 
 
 @functools.cache
-def street(seed: int = 0, people: int = 3, ground: int = 500) -> np.ndarray:
+def make_points(seed: int = 0, people: int = 3, ground: int = 500) -> np.ndarray:
     """Return points (N, 3) float32 of level ground, people (the first one fills PERSON) and a
     wall."""
     rng = np.random.default_rng(seed)
@@ -45,18 +45,18 @@ def street(seed: int = 0, people: int = 3, ground: int = 500) -> np.ndarray:
     return np.concatenate(parts).astype(np.float32)
 
 
-def header() -> Any:
+def make_message_header() -> Any:
     """Return the header of all messages."""
     return make_header(STAMP, "lidar", bag_message)
 
 
-def cloud(kind: str = "columns") -> Any:
+def make_cloud(kind: str = "columns") -> Any:
     """Return a valid PointCloud2; kind: one of KINDS."""
-    xyz = street()[:{"empty": 0, "one": 1}.get(kind)]
+    xyz = make_points()[:{"empty": 0, "one": 1}.get(kind)]
     points = np.zeros(len(xyz), np.dtype(LAYOUTS.get(kind, PLAIN)))
     for i, name in enumerate("xyz"):
         points[name] = xyz[:, i]
-    message = from_array(points, header(), bag_message,
+    message = from_array(points, make_message_header(), bag_message,
                          height=4 if kind == "rows" else 1)
     if kind == "columns":
         body = (xyz[:, 2] > -SENSOR_HEIGHT + 0.05).astype("u1")
@@ -67,46 +67,46 @@ def cloud(kind: str = "columns") -> Any:
 
 
 @functools.cache
-def valid_message(kind: str) -> bytes:
+def make_valid_message(kind: str) -> bytes:
     """Return the CDR of a valid message of a type."""
     if kind == CLOUD:
-        return encode(cloud())
+        return encode(make_cloud())
     if kind == "visualization_msgs/msg/MarkerArray":
         truth = GroundTruth.of([PERSON], [PEDESTRIAN], [{"track_id": 3}])
-        return encode(make_truth_markers(truth, header(), bag_message))
+        return encode(make_truth_markers(truth, make_message_header(), bag_message))
     if kind == "sensor_msgs/msg/CameraInfo":
         return encode(make_camera_info(FORWARD_CAMERA, make_header(STAMP, "camera_optical",
                                                                    bag_message), bag_message))
     if kind == "geometry_msgs/msg/TransformStamped":
-        return encode(make_extrinsics(FORWARD_CAMERA, header(), bag_message))
+        return encode(make_extrinsics(FORWARD_CAMERA, make_message_header(), bag_message))
     if kind == "geometry_msgs/msg/PointStamped":
         x, y, z = map(float, PERSON[:3])
-        return encode(bag_message(kind, header=header(), point=bag_message(
+        return encode(bag_message(kind, header=make_message_header(), point=bag_message(
             "geometry_msgs/msg/Point", x=x, y=y, z=z)))
     if kind == "nav_msgs/msg/Odometry":
-        message = bag_message(kind, header=header(), child_frame_id="lidar")
+        message = bag_message(kind, header=make_message_header(), child_frame_id="lidar")
         message.pose.pose.orientation.w = 1.0
         return encode(message)
     raise LookupError(f"there is no valid message of type {kind}")
 
 
-def mutated(kind: str, rng: np.random.Generator) -> tuple[bytes, str]:
+def mutate_valid_message(kind: str, rng: np.random.Generator) -> tuple[bytes, str]:
     """Return the CDR of a message with one to three changes that leave it decodable, and their
     description."""
     changes = []
     if kind == CLOUD:
         form = pick(rng, KINDS)
-        message = cloud(form)
+        message = make_cloud(form)
         changes.append(form)
     else:
-        message = decode(valid_message(kind), kind)
+        message = decode(make_valid_message(kind), kind)
     for _ in range(int(rng.integers(1, 4))):
         change = pick(rng, CLOUD_CHANGES) if kind == CLOUD else mutate_message
         changes.append(change(message, rng))
     return encode(message), ", ".join(changes)
 
 
-def _values(message: Any, rng: np.random.Generator) -> str:
+def _change_values(message: Any, rng: np.random.Generator) -> str:
     """Set the values of one field, of some points or of all."""
     fields = [f for f in message.fields if 1 <= f.datatype <= 8
               and f.offset + 8 <= message.point_step]
@@ -127,7 +127,7 @@ def _values(message: Any, rng: np.random.Generator) -> str:
     return f"{field.name} = {value} in {int(chosen.sum())} points"
 
 
-def _column(message: Any, rng: np.random.Generator) -> str:
+def _add_column(message: Any, rng: np.random.Generator) -> str:
     """Add a column that our nodes read, of any type and with any values."""
     try:
         count = len(to_array(message))
@@ -151,14 +151,14 @@ def _column(message: Any, rng: np.random.Generator) -> str:
     return f"{name} as {kind}, {how}"
 
 
-def _field(message: Any, rng: np.random.Generator) -> str:
+def _change_field(message: Any, rng: np.random.Generator) -> str:
     """Change the description of one field."""
     if not message.fields:
         return mutate_message(message, rng)
     return f"{(f := pick(rng, message.fields)).name}.{mutate_message(f, rng)}"
 
 
-def _layout(message: Any, rng: np.random.Generator) -> str:
+def _change_layout(message: Any, rng: np.random.Generator) -> str:
     """Make one number of the layout a multiple of another."""
     a, b = rng.permutation(["height", "width", "point_step", "row_step"])[:2]
     factor = pick(rng, (0.5, 1, 2, 3))
@@ -166,12 +166,12 @@ def _layout(message: Any, rng: np.random.Generator) -> str:
     return f"{a} = {factor} {b}"
 
 
-def _data(message: Any, rng: np.random.Generator) -> str:
+def _change_data(message: Any, rng: np.random.Generator) -> str:
     data = np.array(message.data)
     size = int(rng.integers(0, len(data) + 20))
     message.data = np.resize(data, size) if len(data) else np.zeros(size, np.uint8)
     return f"{size} bytes of {len(data)}"
 
 
-CLOUD_CHANGES = (_values, _values, _values, _column, _column, _field, _layout,
-                 _data, mutate_message)
+CLOUD_CHANGES = (_change_values, _change_values, _change_values, _add_column, _add_column,
+                 _change_field, _change_layout, _change_data, mutate_message)
