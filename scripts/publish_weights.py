@@ -43,6 +43,7 @@ from lidar_perception.scoring.run import fill
 from lidar_perception.training.record import round_metrics, select_metrics
 
 ROWS = (("bev_relaxed", "BEV"), ("bev", "BEV"), ("3d_relaxed", "3D"), ("3d", "3D"))
+DEFAULT_SENSOR = {"name": "hdl64e", "beams": 64, "height": 1.73}  # missing in early headers
 SAMPLES = 200  # bootstrap samples of the intervals
 SENSOR_FAILURES = [
     "Other sensors: many people are missed if the beams are sparser than in training.",
@@ -81,9 +82,12 @@ def describe_weights(header: checkpoint.Header, title: str) -> list[str]:
     """Return lines about the network, its training data, range and sensor."""
     training, config = header.training, header.config
     low, high = getattr(config, "low", None), getattr(config, "high", None)
-    sensor = training.get("sensor") or {}
+    sensor = training.get("sensor") or DEFAULT_SENSOR
     init, others = training.get("init"), training["validation_scenes"]
-    start = f", starting from {'shipped weights' if 'package' in init else init}" if init else ""
+    if init:
+        init = "earlier shipped weights" if "package" in init else (
+            "/".join(Path(init).parts[-2:]) if init.startswith("/") else init)
+    start = f", starting from {init}" if init else ""
     return [
         f"Network: {header.network} {config.title}".rstrip() + "; the header of the file has the "
         "full config.",
@@ -100,8 +104,8 @@ def describe_weights(header: checkpoint.Header, title: str) -> list[str]:
         "Range: all clusters of the cloud." if low is None or high is None else
         f"Range: x {low[0]:g} to {high[0]:g} m, y {low[1]:g} to {high[1]:g} m. `range: around` "
         "covers 51.2 m in all directions.",
-        f"Sensor: {sensor.get('name', 'unknown')}, {sensor.get('beams', '?')} beams, "
-        f"{sensor.get('height', '?')} m above the ground.",
+        f"Sensor: {sensor['name']}, {sensor['beams']} beams, {sensor['height']} m above the "
+        "ground.",
         "Scores: calibrated probabilities." if header.calibration else "Scores: not calibrated.",
         "Stored as float16."]
 

@@ -1,4 +1,4 @@
-"""detect: results of every frame, in every format, which read back as they were found."""
+"""detect: results in all formats are equal to the detections."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def drives(tmp_path):
     return tracking_folder(tmp_path / "drives")
 
 
-# What is written
+# Output files
 
 
 @pytest.mark.parametrize("kind", MADE)
@@ -150,7 +150,7 @@ def test_a_bag_holds_what_the_nodes_publish(drives, tmp_path, monkeypatch, cloud
         assert sum(map(len, marked.values())) > 0
 
 
-def test_a_bag_of_a_cloud_that_has_its_stamp_twice_is_written_without_labels(tmp_path, monkeypatch,
+def test_bag_with_duplicate_stamps_is_written_without_labels(tmp_path, monkeypatch,
                                                                               capsys):
     """Nothing would say whose the labels are."""
     frames = [replace(frame, stamp_ns=STAMP) for frame in scans(3)]
@@ -280,7 +280,7 @@ def test_the_number_of_processes_does_not_change_the_result(drives, tmp_path):
     assert read_json(tmp_path / "one") == read_json(tmp_path / "two")
 
 
-def test_another_run_in_the_folder_is_refused_and_forced(kitti, tmp_path, monkeypatch, capsys,
+def test_other_run_in_folder_is_refused_without_force(kitti, tmp_path, monkeypatch, capsys,
                                                          made):
     out = tmp_path / "out"
     assert detect(monkeypatch, kitti, "--out", out, "--format", "kitti,csv", "--limit", 2) == 0
@@ -300,7 +300,7 @@ def test_another_run_in_the_folder_is_refused_and_forced(kitti, tmp_path, monkey
 # What cannot be used
 
 
-def test_frames_that_cannot_be_read_are_named_and_the_others_are_written(kitti, tmp_path,
+def test_unreadable_frames_are_named_and_others_written(kitti, tmp_path,
                                                                          monkeypatch, capsys, made):
     cut, out = kitti / "training/velodyne/000001.bin", tmp_path / "out"
     whole = cut.read_bytes()
@@ -317,7 +317,7 @@ def test_frames_that_cannot_be_read_are_named_and_the_others_are_written(kitti, 
     assert detect(monkeypatch, kitti, "--out", out) == 0 and len(made) == 4
 
 
-def test_labels_and_cameras_that_cannot_be_read_are_not_needed(kitti, tmp_path, monkeypatch,
+def test_unreadable_labels_and_cameras_are_optional(kitti, tmp_path, monkeypatch,
                                                                 capsys):
     write(kitti / "training/label_2/000001.txt", "Car")
     for i in 0, 2, 3:
@@ -378,7 +378,7 @@ def test_pictures_and_a_film_of_every_frame(drives, tmp_path, monkeypatch, made)
     assert len(made) == len(names)
 
 
-def test_a_film_that_cannot_be_made_is_refused_before_any_work(drives, tmp_path, monkeypatch,
+def test_impossible_video_is_refused_before_any_work(drives, tmp_path, monkeypatch,
                                                                capsys, made):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec",

@@ -1,4 +1,4 @@
-"""All around in two looks of a network that knows only what is ahead."""
+"""The range `around` in two passes of a network trained for `ahead`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def shipped(version="v4", range="auto"):
 
 
 def columns_of(scan):
-    """What the experts say of it; of a turned cloud they would say nearly the same."""
+    """Return the experts' columns; for a rotated cloud they would differ slightly."""
     ground = segment_ground(scan, EXPERT_GROUND)
     return {"ground": ground, "cluster_ids": cluster_obstacles(scan.xyz, ground, EXPERT_CLUSTERING)}
 
@@ -55,7 +55,7 @@ def test_a_turned_cloud_has_the_turned_boxes(version, street):
     assert same(turned, replace(found, boxes=rotate_boxes_half_turn(found.boxes)), atol=1e-4)
 
 
-def test_cars_that_are_plain_to_see_are_found_behind_and_beside(street):
+def test_clear_cars_are_found_behind_and_at_the_sides(street):
     truth = street.truth
     plain = np.array([e["num_points"] > 100 and e["visible"] > 0.5 for e in truth.extras])
     angle = np.degrees(np.arctan2(truth.boxes[:, 1], truth.boxes[:, 0]))
@@ -69,7 +69,7 @@ def test_cars_that_are_plain_to_see_are_found_behind_and_beside(street):
     assert len(match_centres(mine[:, :3], cars[:, :3], 1.0)[0]) >= 0.8 * len(cars)
 
 
-def test_away_from_the_border_it_says_what_one_look_says(street):
+def test_around_equals_single_pass_away_from_border(street):
     detector, columns = shipped(), columns_of(street.frame)
     half = replace(detector.proposer.header, config=replace(detector.proposer.config, **HALF))
     one = make_detector(detector.proposer.network, half, detector.params)
@@ -89,7 +89,7 @@ def test_there_and_back_it_is_the_same_detector(street):
     assert trained.with_range("around") is trained and len(trained.proposer.half_turns) == 1
 
 
-def test_nothing_behind_or_nothing_at_all_is_no_trouble(street):
+def test_around_with_empty_half_or_empty_cloud(street):
     detector = shipped(range="around")
     ahead = detector(street.frame.take(np.flatnonzero(street.frame.xyz[:, 0] > 6)))
     assert len(ahead.detections) and ahead.problem is None
@@ -97,7 +97,7 @@ def test_nothing_behind_or_nothing_at_all_is_no_trouble(street):
     assert len(nothing.detections) == 0 and "empty" in nothing.problem
 
 
-def test_what_cannot_see_that_says_so():
+def test_unsupported_range_is_refused():
     config = pointnet_samples.small()
     pointnet = PointNetDetector(pointnet_samples.make_classifier(
         pointnet_samples.lively(config), Header(config)))

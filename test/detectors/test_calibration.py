@@ -1,4 +1,4 @@
-"""Scores as probabilities: order stays, thresholds mean probabilities, broken lines are refused."""
+"""Calibration keeps the order of scores; thresholds are probabilities; bad lines are refused."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LINES = {"Car": (0.6, 0.5), "Pedestrian": (1.4, -0.8)}
 
 @given(st.lists(st.floats(0, 1, width=32), min_size=1, max_size=30), st.floats(0.05, 20),
        st.floats(-20, 20))
-def test_the_order_stays_and_a_threshold_is_found_again(scores, slope, offset):
+def test_calibration_keeps_order_and_is_invertible(scores, slope, offset):
     lines = {"Car": (slope, offset)}
     scores = np.sort(np.array(scores, np.float32))
     found = Detections.of(np.ones((len(scores), 7)), CLASSES.index("Car"), scores)
@@ -51,7 +51,7 @@ def test_the_order_stays_and_a_threshold_is_found_again(scores, slope, offset):
 
 @pytest.mark.parametrize("make", [lambda: random_detector("v4", eager(score=0.0)), random_pointnet],
                          ids=["PointPillars", "PointNet"])
-def test_a_detector_finds_the_same_boxes_and_its_threshold_is_a_probability(make):
+def test_calibrated_detector_finds_same_boxes(make):
     detector, scan = make().with_min_score(0.0), frame()
     plain = detector(scan).detections
     (network,) = detector.networks
@@ -60,7 +60,7 @@ def test_a_detector_finds_the_same_boxes_and_its_threshold_is_a_probability(make
     assert len(found) and same(found, calibrate_scores(plain, LINES), atol=1e-6)
     assert same(detector.with_raw_scores()(scan), plain)
     middle = float(np.median(found.scores))
-    # What is weak suppresses nothing that is strong, so a threshold takes the weak away alone.
+    # Weak boxes do not suppress strong ones, so a threshold only removes weak boxes.
     strict = detector.with_min_score(middle)(scan).detections
     assert 0 < len(strict) <= len(found) and (strict.scores >= np.float32(middle) - 1e-6).all()
     best = detector.with_min_score(1.0)(scan).best
@@ -78,7 +78,7 @@ def test_lines_that_do_not_rise_are_refused(tmp_path, broken):
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_another_calibration_leaves_the_weights_as_they_are_stored(tmp_path, half):
+def test_save_header_keeps_stored_weights(tmp_path, half):
     path, config = tmp_path / "some.safetensors", tiny()
     save_checkpoint(path, lively(config), Header(config, calibration=LINES), half)
     _, before = read_checkpoint(path, type(config))

@@ -1,4 +1,4 @@
-"""Every detector of the package is a value that fulfils the one contract."""
+"""Every detector of the package fulfils the contract."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_these_are_all(detectors):
 
 
 @each_name
-def test_it_says_what_it_can_detect_and_from_which_score_on(detectors, name):
+def test_detector_has_classes_and_thresholds(detectors, name):
     detector = detectors[name]
     assert detector.classes and set(detector.classes) <= set(CLASSES)
     assert set(detector.min_scores) == set(detector.classes)
@@ -89,7 +89,7 @@ def test_an_array_is_taken_like_its_frame(detectors, frame, name):
 
 @each_name
 @pytest.mark.parametrize("full", [255, 65535])
-def test_an_intensity_of_another_scale_is_said_and_read_in_0_to_1(detectors, frame, name, full):
+def test_other_intensity_scale_is_reported_and_normalized(detectors, frame, name, full):
     scan, detector = frame.load(), detectors[name]
     assert scan.intensity.max() > 0.5
     raw = np.column_stack([scan.xyz, np.round(scan.intensity * full)])
@@ -103,7 +103,7 @@ def test_an_intensity_of_another_scale_is_said_and_read_in_0_to_1(detectors, fra
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_what_carries_the_sensor_is_no_detection_wherever_it_looks(seed):
+def test_ego_vehicle_is_dropped_for_any_heading(seed):
     """Boxes that hold it, but for a mast of 1 m, and cars below it that come nearer than 1 m."""
     rng = np.random.default_rng(seed)
     boxes = np.column_stack([rng.uniform(-4, 4, (50, 3)), rng.uniform(0.5, 5, (50, 3)),
@@ -126,7 +126,7 @@ def test_what_carries_the_sensor_is_no_detection_wherever_it_looks(seed):
 
 @pytest.mark.parametrize("pose", [SensorPoseParams(), SensorPoseParams(height=2.4),
                                   SensorPoseParams(roll=np.pi), SensorPoseParams(height=6.0)])
-def test_the_car_that_carries_the_sensor_is_left_out_and_the_next_one_stays(pose):
+def test_ego_vehicle_is_dropped_and_next_car_is_kept(pose):
     """Its roof in three parts, as the weights of the package saw KITTI's; however the sensor is
     mounted, but for one so high above the car that this is another one."""
     up = pose.height - SENSOR_HEIGHT
@@ -149,7 +149,7 @@ def test_every_network_leaves_out_what_carries_it(detectors, frame, monkeypatch)
 
 
 @each_name
-def test_called_again_it_says_the_same_and_leaves_the_frame(detectors, frame, name):
+def test_second_call_is_equal_and_frame_unchanged(detectors, frame, name):
     scan = frame.load()
     before = scan.xyz.copy(), scan.intensity.copy()
     first, again = (detectors[name](scan) for _ in range(2))
@@ -162,7 +162,7 @@ def test_called_again_it_says_the_same_and_leaves_the_frame(detectors, frame, na
 
 
 @each_name
-def test_another_threshold_makes_another_detector_and_leaves_this_one(detectors, frame, name):
+def test_with_min_score_returns_a_copy(detectors, frame, name):
     detector, scan = detectors[name], frame.load()
     before, scores = detector(scan), dict(detector.min_scores)
     strict = detector.with_min_score(0.6)

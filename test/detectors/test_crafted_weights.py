@@ -1,4 +1,4 @@
-"""Weights that somebody has crafted: they can be used, or one line says why not."""
+"""Crafted weights are used or refused with a one-line reason."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ SMALL = {
 
 @pytest.mark.parametrize("kind", SMALL)
 def test_a_mutated_header_is_used_or_refused_with_one_line(kind, tmp_path):
-    """What passes has the tensors' shapes, so it takes no more memory than the file says."""
+    """Accepted headers have the shapes of the tensors, so memory use is bounded by the file."""
     make_header, make, load, params = SMALL[kind]
     header = make_header()
     tensors = make(header.config).state_dict()
@@ -99,7 +99,7 @@ def test_a_mutated_header_is_used_or_refused_with_one_line(kind, tmp_path):
     assert 25 < refused < len(texts)
 
 
-def test_a_header_takes_no_memory_before_the_tensors_fit_it(tmp_path):
+def test_large_header_does_not_allocate_memory(tmp_path):
     header = json.loads(SMALL["pointpillars"][0]().to_json())
     header["config"]["block_channels"] = [65_536, 65_536, 65_536]  # 300 GB of weights
     path = tmp_path / "w.safetensors"
@@ -112,7 +112,7 @@ def test_a_header_takes_no_memory_before_the_tensors_fit_it(tmp_path):
         load_detector(path, "cpu")
 
 
-def test_weights_that_say_the_same_everywhere_detect_nothing_and_are_named():
+def test_constant_scores_are_reported_as_broken_weights():
     config = tiny("v4")
     for value in 0.0, 1.0:
         network = lively(config)

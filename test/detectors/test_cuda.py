@@ -1,4 +1,4 @@
-"""CUDA computes what the CPU does; where there is no GPU these tests are skipped."""
+"""Results on CUDA agree with the CPU; skipped without a GPU."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ def scan(streets):
 
 
 def assert_alike(a: Detections, b: Detections, metres: float = 0.05, score: float = 0.03) -> None:
-    """Whatever is surely found by one is found by the other, at the same place and as likely.
-    Convolutions of CUDA multiply in TF32, which has three digits."""
+    """Check that detections above SURE have a counterpart with similar place and score.
+
+    CUDA convolutions multiply in TF32, with three digits.
+    """
     assert (a.scores > SURE).sum() > 3
     for one, other in ((a, b), (b, a)):
         for k in np.flatnonzero(one.scores > SURE + score):
@@ -49,7 +51,7 @@ def test_all_around_too(scan):
 
 
 @pytest.mark.parametrize("weights", ["pointnet", "fused"])
-def test_without_memory_the_cpu_takes_over_and_says_so(weights, scan):
+def test_cpu_fallback_is_reported(weights, scan):
     detector = open_detector(weights, "cuda")
     on_cuda = detector(scan).detections
     torch.cuda.empty_cache()

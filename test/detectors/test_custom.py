@@ -1,4 +1,4 @@
-"""Detectors of one's own: classes by reference or entry point, in the adapter."""
+"""Custom detectors: classes by reference or entry point, in the adapter."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ value = 3
 
 @pytest.fixture
 def module(tmp_path, monkeypatch):
-    """Name of a module in the current folder, imported anew by each test."""
+    """Name of a module in the current folder, imported again by each test."""
     name = f"own_{tmp_path.name}"
     (tmp_path / f"{name}.py").write_text(MODULE)
     (tmp_path / f"{name}_broken.py").write_text("import nothing_there")

@@ -1,4 +1,4 @@
-"""Laws of PointPillars: configs, pillars, the network."""
+"""PointPillars: configs, pillars and the network."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_versions_are_those_of_the_paper():
                         "v4": [True, False, True, "fpn"]}
 
 
-def test_the_full_baseline_has_as_many_weights_as_pointpillars():
+def test_full_v0_has_as_many_weights_as_pointpillars():
     # 4.8 million: Lang et al. with three classes, six anchors and a direction
     counted = sum(p.numel() for p in make_network(make_config("v0", "full")).parameters())
     by_hand = (9 * 64 + 2 * 64                                                 # points
@@ -122,7 +122,7 @@ def test_pillars_know_their_points():
 
 
 @given(seeds, st.integers(1, 5))
-def test_the_first_points_of_each_pillar_are_those_of_a_loop(seed, most):
+def test_keep_first_per_cell_equals_a_loop(seed, most):
     cells = torch.from_numpy(np.random.default_rng(seed).integers(0, 9, 50))
     counts, kept = {}, []
     for i, cell in enumerate(cells.tolist()):
@@ -141,7 +141,7 @@ def test_the_order_of_the_points_makes_no_difference():
     assert image.max() > 0
 
 
-def test_points_keep_their_precision_where_the_rest_runs_in_16_bits():
+def test_points_keep_float32_precision_with_amp():
     config = tiny()
     network = lively(config)
     pillars = make_pillar_batch([some_points(config)], config)
@@ -151,7 +151,7 @@ def test_points_keep_their_precision_where_the_rest_runs_in_16_bits():
         assert network.features(pillars).dtype == torch.bfloat16
 
 
-def test_a_network_in_16_bits_says_about_the_same_in_float32():
+def test_bf16_network_agrees_with_float32():
     config = tiny()
     pillars = make_pillars(some_points(config).numpy(), config)
     said = {}
@@ -162,7 +162,7 @@ def test_a_network_in_16_bits_says_about_the_same_in_float32():
     assert np.abs(said["bf16"] - said["off"]).max() < 0.05 * np.abs(said["off"]).max()
 
 
-def test_moving_the_points_by_a_pillar_moves_the_image_by_a_cell():
+def test_shift_by_one_pillar_shifts_image_by_one_cell():
     config = tiny("v0", low=(0.0, -4.0, -3.0), high=(8.0, 4.0, 1.0), cell=0.25)
     network = lively(config)
     network.pillar_net.linear.weight[:, :2] = 0  # x and y themselves
@@ -210,7 +210,7 @@ def test_limited_pillars_are_those_of_padded_code(middle_z):
 
 @each_version
 @pytest.mark.parametrize("changes", [{}, dict(fusion="concat"), dict(block_strides=(1, 2, 2))])
-def test_every_version_gives_an_output_for_every_anchor(version, changes):
+def test_every_version_has_outputs_for_all_anchors(version, changes):
     config = tiny(version, **changes)
     count = len(anchor_tensors(config)[0])
     assert count == config.head_grid[0] * config.head_grid[1] * 6

@@ -1,4 +1,4 @@
-"""Laws of what a network is taught and how it is read: anchors, boxes, targets, losses, NMS."""
+"""Training targets and decoding: anchors, boxes, targets, losses, NMS."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def some_boxes(seed, count=20, spread=6.0) -> np.ndarray:
 # anchors and boxes
 
 
-def test_anchors_lie_in_rows_along_y_then_x_then_class_then_yaw():
+def test_anchor_order_is_y_x_class_yaw():
     config = tiny("v0")
     anchors, kinds = anchor_tensors(config)
     height, width = config.head_grid
@@ -77,7 +77,7 @@ def test_decoding_undoes_encoding(seed, offset):
 # targets
 
 
-def test_the_overlap_of_boxes_along_the_axes_is_the_usual_one():
+def test_axis_aligned_iou_equals_textbook_formula():
     a = torch.tensor([[0, 0, 0, 4.0, 2, 1, 0.0]])
     b = torch.tensor([[1, 0, 0, 2.0, 4, 1, np.pi / 2 + 0.1], [9, 0, 0, 1, 1, 1, 0]])
     assert nearest_axis_iou(a, b)[0].tolist() == [pytest.approx(6 / 10), 0.0]
@@ -128,7 +128,7 @@ def test_anchors_that_are_not_near_overlap_nothing(seed):
     assert len(find_near_anchors(anchors, config, boxes[:0], 0)) == 0
 
 
-def test_every_object_has_an_anchor_and_the_order_of_objects_makes_no_difference():
+def test_every_object_has_an_anchor_in_any_order():
     config = tiny("v0")
     anchors = anchor_tensors(config)[0]
     there = assign(anchors, config, BOXES, LABELS)
@@ -144,7 +144,7 @@ def test_every_object_has_an_anchor_and_the_order_of_objects_makes_no_difference
         assert near.any() and (there.labels[0, positive][near] == label).all()
 
 
-def test_objects_without_size_and_no_objects_leave_background():
+def test_no_valid_objects_give_background_only():
     config = tiny("v0")
     broken = BOXES.clone()
     broken[0, 3], broken[1, 0] = 0, torch.nan
@@ -165,7 +165,7 @@ def outputs_of(targets, classes=3, sure=12.0):
     return Outputs(logits, targets.codes.clone(), directions)
 
 
-def test_what_is_right_costs_nothing_and_what_is_wrong_costs():
+def test_loss_is_zero_for_targets_and_positive_for_errors():
     config = tiny("v0")
     kinds = anchor_tensors(config)[1]
     targets = assign(anchor_tensors(config)[0], config, BOXES, LABELS)
@@ -189,7 +189,7 @@ def batch(clouds: list[Targets]) -> Targets:
                  torch.device("cpu"))
 
 
-def test_targets_without_the_background_hold_everything():
+def test_sparse_targets_round_trip():
     config = tiny("v0")
     anchors = anchor_tensors(config)[0]
     clouds = [assign(anchors, config, BOXES[:n], LABELS[:n]) for n in (2, 0, 1)]
@@ -198,7 +198,7 @@ def test_targets_without_the_background_hold_everything():
         assert torch.equal(whole, torch.cat(parts))
 
 
-def test_losses_of_a_batch_twice_are_the_same_and_do_not_see_what_is_ignored():
+def test_loss_of_doubled_batch_is_equal_and_skips_ignored():
     config = tiny("v0")
     anchors, kinds = anchor_tensors(config)
     targets, out = assign(anchors, config, BOXES, LABELS), random_outputs(anchors)
@@ -214,7 +214,7 @@ def test_losses_of_a_batch_twice_are_the_same_and_do_not_see_what_is_ignored():
                                once.total)
 
 
-def test_scores_of_every_class_weigh_alike_however_many_anchors_it_is_on():
+def test_classes_have_equal_weight_for_any_number_of_anchors():
     config = tiny("v0")
     anchors, kinds = anchor_tensors(config)
     targets, out = assign(anchors, config, BOXES, LABELS), random_outputs(anchors, 2)
@@ -259,7 +259,7 @@ def test_suppression_is_that_of_a_slow_loop(seed, across):
     assert rotated_nms(boxes[:0], scores[:0], labels[:0], limit).tolist() == []
 
 
-def test_suppression_of_many_boxes_of_all_sizes_is_that_of_all_pairs():
+def test_nms_equals_brute_force_over_all_pairs():
     """A long box reaches far; boxes without area or position overlap nothing and stay."""
     rng = np.random.default_rng(0)
     boxes = some_boxes(0, 200, spread=20)

@@ -31,7 +31,7 @@ each_version = pytest.mark.parametrize("version", VERSIONS)
 # experts
 
 @each_version
-def test_columns_that_are_given_say_the_same_as_those_that_are_computed(version):
+def test_given_columns_equal_computed_columns(version):
     detector = random_detector(version)
     scan = frame()
     config = detector.proposer.config
@@ -42,7 +42,7 @@ def test_columns_that_are_given_say_the_same_as_those_that_are_computed(version)
     ids = np.zeros(len(scan), np.uint32)
     obstacles = indices[~flat[indices]]
     ids[obstacles] = cluster(scan.xyz[obstacles], EXPERT_CLUSTERING, measure_density(seen.xyz))
-    ids[ids > 0] *= 3  # whatever the numbers
+    ids[ids > 0] *= 3  # ids need not be consecutive
     assert flat.any() and ids.max() >= 6
     computed = detector(scan)
     assert len(computed.detections) > 3
@@ -98,7 +98,7 @@ def test_the_map_is_that_of_a_plain_loop_over_cells():
     assert drawn.shape == (3, 64, 64) and all(layer.any() for layer in drawn)
 
 
-def test_a_cluster_on_a_line_is_drawn_where_its_centre_is():
+def test_collinear_cluster_is_drawn_at_its_centre():
     config = tiny("v4")
     xyz = np.float32([[4.1, 1.1, -1], [4.5, 1.1, -0.5], [4.9, 1.1, 0]])
     image = draw_clusters(xyz, np.ones(3, np.int32), config)
@@ -108,7 +108,7 @@ def test_a_cluster_on_a_line_is_drawn_where_its_centre_is():
 
 # the detector
 
-def test_what_is_visible_does_not_depend_on_the_height_of_the_sensor():
+def test_view_does_not_depend_on_sensor_height():
     config, rng = tiny(), np.random.default_rng(0)
     scan = PointCloud(rng.uniform([-2, -7, -6], [12, 7, 5], (500, 3)).astype(np.float32))
     view = NormalizedView.of(scan, low=config.low, high=config.high)
@@ -120,7 +120,7 @@ def test_what_is_visible_does_not_depend_on_the_height_of_the_sensor():
     assert (view.frame.xyz >= low).all() and (view.frame.xyz < high).all()
 
 
-def test_detections_are_above_their_thresholds_in_order_and_apart():
+def test_detections_pass_thresholds_sorted_without_overlap():
     detector = random_detector("v4")
     said = detector(frame())
     found = said.detections
@@ -137,7 +137,7 @@ def test_detections_are_above_their_thresholds_in_order_and_apart():
     assert same(detector(frame()), fewer[:2])
 
 
-def test_another_height_of_the_sensor_moves_the_boxes_only():
+def test_sensor_height_only_shifts_boxes():
     detector = random_detector("v4")
     scan, found = frame(), detector(frame()).detections
     higher = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
@@ -178,20 +178,20 @@ def test_intensity_is_normalized_and_may_be_left_out():
     (np.zeros((0, 3)), "empty"), (np.full((5, 3), np.nan), "network's range"),
     ([[-5, 0, 0], [500, 0, 0]], "network's range")])
 @pytest.mark.parametrize("version", ["v0", "v4"])
-def test_a_cloud_with_nothing_to_see_has_no_detections_and_a_reason(version, xyz, words):
+def test_empty_cloud_has_no_detections_and_a_problem(version, xyz, words):
     detector = random_detector(version)
     found = detector(PointCloud(np.asarray(xyz, np.float32)))
     assert len(found.detections) == 0 and words in found.problem and found.timings["network"] == 0
     assert detector(frame()).problem is None
 
 
-def test_ground_alone_has_no_detections_and_a_reason():
+def test_ground_only_cloud_has_a_problem():
     detector, scan = random_detector("v4"), frame()
     found = detector(scan, ground=np.ones(len(scan), bool))
     assert len(found.detections) == 0 and "ground.sensor_pose" in found.problem
 
 
-def test_where_nothing_passes_the_best_scores_are_said():
+def test_best_scores_are_reported_without_detections():
     detector, scan = random_detector("v4", eager(score=0.0)), frame()
     assert detector(scan).best == {}
     found = detector(scan).detections
@@ -241,7 +241,7 @@ class OutOfMemory(TorchNetwork):
         return super().__call__(pillars, maps)
 
 
-def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so():
+def test_cpu_fallback_after_out_of_memory_is_reported():
     config, scan, meta = tiny(), frame(), "meta"
     broken = make_detector(OutOfMemory(lively(config)), Header(config), eager(), meta)
     for _ in range(2):

@@ -1,5 +1,4 @@
-"""The fused detector: boxes come to the points and the ground, more evidence is never less likely,
-and the whole is a detector like any other."""
+"""The fused detector: box corrections, combination of evidence, and the detector contract."""
 
 from __future__ import annotations
 
@@ -51,7 +50,7 @@ def random_boxes(rng, count: int) -> np.ndarray:
 
 
 @given(SEEDS, st.integers(0, 2000), st.integers(0, 30), st.floats(0, 0.5))
-def test_all_boxes_at_once_hold_what_each_holds(seed, count, boxes, margin):
+def test_points_in_boxes_equals_points_in_box(seed, count, boxes, margin):
     rng = np.random.default_rng(seed)
     xyz = rng.uniform([-22, -22, -2], [22, 22, 2], (count, 3)).astype(np.float32)
     xyz[::50, rng.integers(3)] = rng.choice([np.nan, np.inf, -np.inf, 1e30])
@@ -64,14 +63,14 @@ def test_all_boxes_at_once_hold_what_each_holds(seed, count, boxes, margin):
 
 
 @given(SEEDS, st.floats(-0.25, 0.25), st.floats(-0.1, 0.1))
-def test_the_ground_of_a_slope_is_the_slope(seed, along, across):
+def test_fit_ground_heights_on_a_slope(seed, along, across):
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-20, 20, (12000, 2))
     ground = np.column_stack([xy, xy @ [along, across] - 1.7])
     places = rng.uniform(-15, 15, (10, 2))
     heights = fit_ground_heights(ground, places)
     np.testing.assert_allclose(heights, places @ [along, across] - 1.7, atol=1e-4)
-    # Order does not matter, nor what lies elsewhere; without ground nothing is known.
+    # The order of points and distant points have no effect; without ground the result is NaN.
     np.testing.assert_allclose(fit_ground_heights(ground[::-1], places), heights, atol=1e-9)
     far = np.concatenate([ground, ground + [200, 0, 9]])
     np.testing.assert_allclose(fit_ground_heights(far, places), heights, atol=1e-9)
@@ -96,7 +95,7 @@ def shell(box: np.ndarray, rng, count: int = 400) -> np.ndarray:
 
 
 @given(SEEDS)
-def test_a_car_that_is_off_comes_to_its_points_and_one_that_is_right_stays(seed):
+def test_move_to_points_corrects_shifted_car_only(seed):
     rng = np.random.default_rng(seed)
     away = rng.uniform(8, 30)
     way = rng.uniform(-np.pi, np.pi)
@@ -118,7 +117,7 @@ def test_a_car_that_is_off_comes_to_its_points_and_one_that_is_right_stays(seed)
     assert np.hypot(*(moved - off)[0, :2]) <= 2 * MARGIN_M
 
 
-def test_boxes_stand_on_the_ground_where_it_is_known():
+def test_move_to_ground_skips_unknown_heights():
     boxes = random_boxes(np.random.default_rng(0), 20)
     floors = np.where(np.arange(20) % 4, boxes[:, 2] - 1, np.nan)
     on = move_to_ground(boxes, floors, 1.0)
@@ -129,7 +128,7 @@ def test_boxes_stand_on_the_ground_where_it_is_known():
 
 
 @given(SEEDS)
-def test_a_box_moves_towards_another_of_the_same_object_and_keeps_its_front(seed):
+def test_move_towards_interpolates_and_keeps_heading(seed):
     rng = np.random.default_rng(seed)
     boxes, others = random_boxes(rng, 20), random_boxes(rng, 20)
     silent = rng.random(20) < 0.3
@@ -148,7 +147,7 @@ def test_a_box_moves_towards_another_of_the_same_object_and_keeps_its_front(seed
 
 
 @given(SEEDS)
-def test_more_evidence_is_never_less_likely_and_silence_is_neither(seed):
+def test_probability_increases_with_evidence(seed):
     rng = np.random.default_rng(seed)
     class_ids = rng.choice([CLASSES.index(name) for name in load_shipped_models()], 50)
     evidence = {source: to_log_odds(rng.uniform(0, 1, 50)) for source in KNOTS}
@@ -167,8 +166,8 @@ def test_more_evidence_is_never_less_likely_and_silence_is_neither(seed):
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_bound_of_a_probability_holds_for_any_answer_and_any_curve(seed):
-    """PointNet is not asked about proposals whose bound is below the threshold."""
+def test_max_probability_holds_for_any_evidence_and_curve(seed):
+    """PointNet skips proposals whose bound is below the threshold."""
     rng = np.random.default_rng(seed)
     models = {name: {"bias": rng.normal(), "curves": {
         source: {"knots": [-3.0, -1.0, 1.0, 3.0], "values": rng.normal(0, 2, 4).tolist(),
@@ -182,7 +181,7 @@ def test_bound_of_a_probability_holds_for_any_answer_and_any_curve(seed):
     np.testing.assert_array_equal(bound, np.max(answers, axis=0))
 
 
-def test_people_at_one_place_are_one_and_cars_do_not_share_any():
+def test_remove_duplicates_by_class():
     boxes = np.array([[10, 0, 0, 0.6, 0.6, 1.8, 0], [10.5, 0.2, 0, 0.6, 0.6, 1.8, 0],
                       [10, 5, 0, 4, 1.7, 1.5, 0], [10, 6.8, 0, 4, 1.7, 1.5, 0],
                       [10.3, 5.1, 0, 4, 1.7, 1.5, 0], [10.2, 0, 0, 1.7, 0.6, 1.8, 0],
@@ -202,7 +201,7 @@ def detector():
     return FusedDetector(random_detector("v4").proposer, random_classifier().classifier, eager)
 
 
-def test_every_part_of_the_contract(detector):
+def test_fused_fulfils_the_detector_contract(detector):
     scan = frame()
     found = detector(scan)
     assert len(found.detections) > 3 and tuple(found.timings) == STEPS
@@ -225,25 +224,25 @@ def test_every_part_of_the_contract(detector):
         detector(scan, ground=np.zeros(3, bool))
 
 
-def test_a_higher_sensor_and_given_columns_change_nothing(detector):
+def test_sensor_height_and_given_columns_change_nothing(detector):
     scan = frame()
     found = detector(scan).detections
     high = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
     above = detector.with_sensor_height(1.73 + 0.5)(high).detections
     above = replace(above, boxes=above.boxes + np.array([0, 0, 0.5, 0, 0, 0, 0], np.float32))
-    # But for what would carry the one or the other sensor.
+    # Except for boxes that would be the ego vehicle of one of the sensors.
     above, below = drop_ego_vehicle(above, 1.73), drop_ego_vehicle(found, 1.73 + 0.5)
     assert len(below) > 90
     np.testing.assert_allclose(above.boxes, below.boxes, atol=2e-3)
     np.testing.assert_allclose(above.scores, below.scores, atol=2e-3)
     proposals = detector.propose(scan)
-    # Of what the network does not see nothing is asked.
+    # Points outside the range do not need a ground label.
     ground = ~np.isin(scan.xyz.view("V12").ravel(), proposals.obstacles.view("V12").ravel())
     assert same(detector(scan, ground=ground), found)
 
 
-def test_an_intensity_that_is_left_out_is_as_one_that_is_not_there(detector):
-    """For the ground, too, which else loses what is low and dark as reflections."""
+def test_ignored_intensity_equals_missing_intensity(detector):
+    """Also for the ground segmentation, which removes low dark points as reflections."""
     scan, other = frame(), copy.copy(detector)
     other.params = with_values(detector.params, {"fused.use_intensity": False})
     pit = np.random.default_rng(0).uniform([4, -4, -2.81], [9, 4, -2.79], (3000, 3))
@@ -255,16 +254,16 @@ def test_an_intensity_that_is_left_out_is_as_one_that_is_not_there(detector):
     assert len(other.propose(scan).ground) == len(detector.propose(scan).ground)
 
 
-def test_as_many_boxes_are_looked_at_as_asked_for_the_likeliest_ones(detector):
+def test_max_proposals_keeps_the_best_boxes(detector):
     whole, other = copy.copy(detector), copy.copy(detector)
     own = with_values(detector.params, {"fused.classifier_box": 0.0})
     whole.params, other.params = own, with_values(own, {"fused.max_proposals": 9})
     every = whole.propose(frame()).detections
-    few = other.propose(frame()).detections  # but for what would carry the sensor
+    few = other.propose(frame()).detections  # without the ego vehicle
     assert len(every) > 100 and 0 < len(few) <= 9 and same(few, every[:len(few)])
 
 
-def test_boxes_are_halfway_between_both_networks(detector):
+def test_classifier_box_interpolates_between_networks(detector):
     def looked(share: float) -> tuple[np.ndarray, np.ndarray]:
         other = copy.copy(detector)
         other.params = with_values(detector.params, {"fused.classifier_box": share})
@@ -277,23 +276,22 @@ def test_boxes_are_halfway_between_both_networks(detector):
 
 
 @pytest.mark.parametrize("height, stays", [(0.4, True), (1.0, True), (1.73, False), (6.0, True)])
-def test_a_car_close_to_a_sensor_that_it_does_not_carry_is_looked_at(detector, monkeypatch, height,
-                                                                     stays):
-    """What carries the sensor depends on how high that is, and not on how high networks have it."""
+def test_nearby_car_that_is_not_ego_vehicle_is_kept(detector, monkeypatch, height, stays):
+    """The ego vehicle is determined with the real height of the sensor, not with 1.73 m."""
     car = Detections.of([[0, 1.4, -0.98, 4, 1.6, 1.5, 0]], CAR, 0.9)  # 0.6 m aside
     monkeypatch.setattr(detector.proposer.__class__, "propose", lambda *_: DetectionResult(car))
     assert len(detector.with_sensor_height(height).propose(frame()).detections) == stays
 
 
-def test_it_says_so_when_a_part_had_to_leave_its_device(detector):
+def test_fallback_of_a_part_is_reported(detector):
     other = copy.copy(detector)
     other.classifier = copy.copy(detector.classifier)
     other.classifier.placement = Placement(CPU, "cuda is out of memory")
     assert other(frame()).problem == "cuda is out of memory" and detector(frame()).problem is None
 
 
-def test_no_part_leaves_its_device_where_it_may_not(detector, monkeypatch):
-    """What the node is told holds for both networks."""
+def test_no_fallback_if_cpu_fallback_is_off(detector, monkeypatch):
+    """The parameter of the node applies to both networks."""
     def predict(*_, **__):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
     monkeypatch.setattr(classifier, "predict", predict)
@@ -305,7 +303,7 @@ def test_no_part_leaves_its_device_where_it_may_not(detector, monkeypatch):
         other(frame())
 
 
-def test_parameters_may_change_between_two_clouds(detector):
+def test_parameters_can_change_between_clouds(detector):
     other = copy.copy(detector)
     other.params = with_values(detector.params, {"fused.proposals": 0.6})
     assert len(other(frame()).detections) < len(detector(frame()).detections)

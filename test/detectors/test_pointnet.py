@@ -1,4 +1,4 @@
-"""The cluster network of paper C: what it reads, what it makes of it, boxes and scores."""
+"""PointNet (paper C): inputs, the network, boxes and scores."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ def called(net, clusters, **changes):
                      for name in ("points", "valid", "context")))
 
 
-# what it reads
+# inputs
 
-def test_clusters_are_the_points_of_each_number_in_their_order(rng):
+def test_make_clusters_groups_points_by_id(rng):
     frame = PointCloud(rng.normal(size=(50, 3)).astype(np.float32), rng.random(50, np.float32))
     ids = rng.integers(-2, 6, 50)
     ids[ids == 4] = 5
@@ -82,7 +82,7 @@ def test_clusters_are_the_points_of_each_number_in_their_order(rng):
     assert not plain.points[:, 3].any()
 
 
-def test_points_are_drawn_without_repeating_one_and_no_cluster_minds_its_neighbours(rng):
+def test_sampled_points_are_unique_and_independent_of_others(rng):
     clusters = blobs(rng, [1, 7, 24, 90, 400])
     inputs = make_network_input(clusters, 24)
     assert inputs.valid.sum(axis=1).tolist() == [1, 7, 24, 24, 24]
@@ -98,7 +98,7 @@ def test_points_are_drawn_without_repeating_one_and_no_cluster_minds_its_neighbo
     assert np.array_equal(other.context, inputs.context)
 
 
-def test_the_ground_is_that_around_a_place_however_it_slopes(rng):
+def test_ground_height_follows_slopes(rng):
     flat = rng.uniform(-40, 40, (20_000, 3))
     flat[:, 2] = 0.05 * flat[:, 0] - 1.7
     flat = flat[np.hypot(flat[:, 0] - 10, flat[:, 1]) > 4]  # none near here, but farther on
@@ -123,7 +123,7 @@ def test_the_ground_is_that_around_a_place_however_it_slopes(rng):
                        here.context[1])
 
 
-def test_wherever_a_cluster_lies_around_the_sensor_it_looks_the_same(rng):
+def test_network_input_does_not_depend_on_azimuth(rng):
     clusters, turn = blobs(rng, [30, 40]), 2.0
     turned = clusters.points.copy()
     cos, sin = np.cos(turn), np.sin(turn)
@@ -144,7 +144,7 @@ def test_wherever_a_cluster_lies_around_the_sensor_it_looks_the_same(rng):
 
 # the network
 
-def test_the_nearest_are_those_that_a_full_search_finds(rng):
+def test_nearest_equals_brute_force(rng):
     xyz = torch.from_numpy(rng.normal(size=(3, 20, 3)))
     valid = torch.from_numpy(rng.random((3, 20)) < 0.7)
     valid[:, :5] = True
@@ -207,7 +207,7 @@ def test_norms_go_into_the_layers_before_them(rng):
         assert torch.allclose(mine, theirs, atol=1e-4)
 
 
-def test_every_switch_of_the_ablation_changes_the_network_or_the_clusters():
+def test_every_ablation_switch_has_an_effect():
     made = {name: make_pointnet_config(name) for name in ABLATIONS}
     known = {(c.clustering, c.groups, c.mrg, c.skip) for c in made.values()}
     assert len(known) == len(ABLATIONS)
@@ -220,7 +220,7 @@ def test_every_switch_of_the_ablation_changes_the_network_or_the_clusters():
     assert made["base"].clustering.euclidean.threshold == "fixed"
 
 
-def test_a_config_survives_json_and_what_cannot_be_is_said():
+def test_config_round_trip_and_invalid_values():
     config = make_pointnet_config("pointnet2", points=64)
     assert parse_config(config_module.PointNetConfig, asdict(config), "") == config
     with pytest.raises(InputError, match="no network 'resnet'"):
@@ -263,7 +263,7 @@ def test_decoding_undoes_encoding(rng):
     assert np.allclose(wrap_angle(back[:, 6] - boxes[:, 6]), 0, atol=1e-5)
 
 
-def test_the_loss_is_least_where_everything_is_right_and_asks_no_box_of_background(rng):
+def test_loss_is_lowest_for_targets_and_ignores_background_boxes(rng):
     config = make_pointnet_config()
     inputs = make_network_input(blobs(rng, [5] * 6), 8)
     boxes = np.column_stack([inputs.centres, np.full((6, 3), 1.5), np.linspace(-3, 3, 6)])
@@ -286,7 +286,7 @@ def test_the_loss_is_least_where_everything_is_right_and_asks_no_box_of_backgrou
     assert nothing.boxes == 0 and torch.isfinite(nothing.total)
 
 
-def test_calibration_makes_scores_as_often_right_as_they_say(rng):
+def test_calibration_makes_scores_match_accuracy(rng):
     net = network()
     truth = torch.from_numpy(rng.normal(size=(4000, 4)))
     labels = torch.distributions.Categorical(logits=truth).sample()
@@ -304,7 +304,7 @@ def test_calibration_makes_scores_as_often_right_as_they_say(rng):
     assert calibration_error(np.eye(3), np.array([1, 2, 0])) == 1.0
 
 
-def test_of_boxes_on_the_same_object_the_best_is_kept(rng):
+def test_best_of_overlapping_boxes_is_kept(rng):
     config = make_pointnet_config()
     predictions = predict(TorchPointNet(network()), blobs(rng, [20] * 4))
     boxes = np.tile(np.array([5, 5, 0, 4, 2, 1.5, 0.3], np.float32), (4, 1))

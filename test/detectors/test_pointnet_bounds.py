@@ -1,4 +1,4 @@
-"""However many clusters a cloud has, the network looks at a number of them that is known."""
+"""The work of PointNet is bounded for any number of clusters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lidar_perception.types import PointCloud
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_small_and_large_clusters_and_many_are_no_trouble():
+def test_clusters_of_all_sizes_and_counts_work():
     rng = np.random.default_rng(0)
     detector = random_detector(with_values(eager(), {"pointnet.min_points": 1}))
     network, batches = detector.classifier.network, []
@@ -35,7 +35,7 @@ def test_small_and_large_clusters_and_many_are_no_trouble():
     assert "farthest 1000 of 5000 clusters are ignored" in found.problem
 
 
-def test_of_too_many_clusters_the_nearest_are_looked_at_and_the_others_counted():
+def test_excess_clusters_are_dropped_by_distance_and_counted():
     rng = np.random.default_rng(0)
     centres = np.column_stack([np.linspace(4, 60, 300), rng.uniform(-3, 3, 300), np.zeros(300)])
     rng.shuffle(centres)
@@ -58,7 +58,7 @@ def test_of_too_many_clusters_the_nearest_are_looked_at_and_the_others_counted()
     assert 0 < len(capped.detections) < len(everything.detections)
 
 
-def test_the_ground_is_found_under_each_cluster_however_far_another_one_is():
+def test_ground_height_does_not_depend_on_distant_clusters():
     rng = np.random.default_rng(1)
     ground = rng.uniform([-40, -40, -1.8], [40, 40, -1.6], (5000, 3)).astype(np.float32)
     places = rng.uniform(-30, 30, (50, 2))

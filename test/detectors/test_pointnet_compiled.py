@@ -1,4 +1,4 @@
-"""The compiled cluster network computes what torch computes."""
+"""The compiled PointNet agrees with torch."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def moved(found: Detections, turn: float = 0.0, shift=(0, 0, 0)) -> Detections:
 
 def alike(a: Detections | DetectionResult, b: Detections | DetectionResult,
           atol: float = 1e-4) -> bool:
-    """Whether both say the same; scores that hardly differ may have changed indices."""
+    """Return True if both are equal; detections with almost equal scores may be swapped."""
     a, b = (x.detections if isinstance(x, DetectionResult) else x for x in (a, b))
     if len(a) != len(b):
         return False
@@ -80,7 +80,7 @@ def alike(a: Detections | DetectionResult, b: Detections | DetectionResult,
 
 # clusters
 
-def test_columns_that_are_given_say_the_same_as_those_that_are_computed(ids):
+def test_given_columns_equal_computed_columns(ids):
     detector, scan = random_detector(), frame()
     computed = detector(scan).detections
     assert len(computed) > 3 and len(set(computed.class_ids)) > 1
@@ -112,7 +112,7 @@ def test_clusters_do_not_know_of_each_other(ids):
     assert alike(joined, everything)
 
 
-def test_a_frame_without_clusters_has_no_detections_and_a_reason(ids):
+def test_frame_without_clusters_has_a_problem(ids):
     detector, scan = random_detector(), frame()
     nothing = np.zeros(len(scan), np.int32)
     far = PointCloud(np.float32([[9, 0, -1], [20, 3, 0]]), np.zeros(2, np.float32))
@@ -132,7 +132,7 @@ def test_a_frame_without_clusters_has_no_detections_and_a_reason(ids):
 
 # where the sensor is
 
-def test_the_scene_turned_about_the_sensor_has_its_boxes_turned(ids):
+def test_rotated_scene_has_rotated_boxes(ids):
     detector, scan = random_detector(), frame()
     found = detector(scan, cluster_ids=ids).detections
     cos, sin = np.cos(2.0), np.sin(2.0)
@@ -141,14 +141,14 @@ def test_the_scene_turned_about_the_sensor_has_its_boxes_turned(ids):
     assert alike(detector(turned, cluster_ids=ids), moved(found, 2.0), 2e-3)
 
 
-def test_another_height_of_the_sensor_moves_the_boxes_only(ids):
+def test_sensor_height_only_shifts_boxes(ids):
     detector, scan = random_detector(), frame()
     known = {"clustering.density": 0.0}  # which depends on where a cloud is seen from
     for columns in {"cluster_ids": ids}, {}:
         detector.params = with_values(eager(), known)
         found = detector(scan, **columns).detections
         higher = replace(scan, xyz=scan.xyz - np.float32([0, 0, 0.5]))
-        # heights are measured from the ground that is there, so that nobody need say it
+        # heights are relative to the ground around, so no parameter is needed
         assert alike(detector(higher, **columns), moved(found, shift=(0, 0, -0.5)), 1e-3)
         detector.params = with_values(eager(), known | {"ground.sensor_pose.height": 2.23})
         assert alike(detector(higher, **columns), moved(found, shift=(0, 0, -0.5)), 1e-3)
@@ -171,7 +171,7 @@ def test_a_tilted_sensor_finds_the_same_boxes_in_its_own_frame(roll, pitch, ids)
 
 # scores, boxes, intensity
 
-def test_detections_are_above_their_thresholds_in_order_and_apart(ids):
+def test_detections_pass_thresholds_sorted_without_overlap(ids):
     detector, scan = random_detector(), frame()
     found = detector(scan, cluster_ids=ids).detections
     assert (np.diff(found.scores) <= 0).all() and len(found) > 3
@@ -194,7 +194,7 @@ def test_detections_are_above_their_thresholds_in_order_and_apart(ids):
     assert len(both) > len(detector(scan, cluster_ids=halves).detections)
 
 
-def test_where_nothing_passes_the_best_scores_are_said(ids):
+def test_best_scores_are_reported_without_detections(ids):
     detector, scan = random_detector(), frame()
     found = detector(scan, cluster_ids=ids).detections
     assert detector(scan, cluster_ids=ids).best == {} and len(found) == ids.max()
@@ -246,8 +246,8 @@ def test_columns_of_another_length_are_refused():
 
 # devices
 
-def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(ids, monkeypatch):
-    """As if everything but the CPU had no memory."""
+def test_cpu_fallback_after_out_of_memory_is_reported(ids, monkeypatch):
+    """Simulate a GPU without memory."""
     from lidar_perception.detectors.pointnet import classifier as module
     scan, expected, real = frame(), random_detector()(frame(), cluster_ids=ids), module.predict
     broken = random_detector()
@@ -309,7 +309,7 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
     assert load_network(first)[0] == load_network(other)[0]
 
 
-def test_weights_of_another_network_or_other_classes_are_refused(saved, tmp_path):
+def test_weights_of_other_network_or_classes_are_refused(saved, tmp_path):
     path, other, header = saved
     with pytest.raises(InputError, match=r"holds a PointNet, .*pointnet_detector.*PointPillars"):
         load_network(path)
@@ -369,7 +369,7 @@ def test_evaluation_runs_either_network(saved, tmp_path):
         assert content["frames"] == 2 and content["ms"] > 0 and not content["skipped"]
 
 
-def test_weights_that_do_not_come_with_the_package_are_asked_for(saved, tmp_path, monkeypatch):
+def test_missing_shipped_weights_are_requested(saved, tmp_path, monkeypatch):
     path, _, _ = saved
     monkeypatch.setattr(weights_module, "WEIGHTS", tmp_path / "own.safetensors")
     with pytest.raises(InputError, match="the package has no PointNet weights"):

@@ -1,4 +1,4 @@
-"""The sparse engine of PointPillars computes what torch computes."""
+"""The sparse engine of PointPillars agrees with torch."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
     assert len(found.detections) and same(found, expected)
 
 
-def test_a_checkpoint_of_another_network_is_refused_with_both_values(saved):
+def test_other_config_is_refused_with_both_values(saved):
     path, _, _ = saved
     with pytest.raises(InputError, match=r"version is v4, expected was v2"):
         load_network(path, tiny("v2"))
@@ -105,7 +105,7 @@ def test_a_network_begins_with_what_fits_of_another(saved):
         copy_matching_weights(torch.nn.Linear(2, 3), path, NetworkConfig)
 
 
-def test_files_that_are_no_checkpoints_are_refused(saved, tmp_path):
+def test_invalid_checkpoint_files_are_refused(saved, tmp_path):
     path, _, _ = saved
     content = path.read_bytes()
     length = struct.unpack("<Q", content[:8])[0]
@@ -143,7 +143,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(saved, monkeypatch):
     assert path.read_bytes() == before and [*path.parent.iterdir()] == [path]
 
 
-def test_weights_that_do_not_come_with_the_package_are_asked_for(tmp_path, monkeypatch):
+def test_missing_shipped_weights_are_requested(tmp_path, monkeypatch):
     monkeypatch.setattr(weights_module, "WEIGHTS", tmp_path)
     with pytest.raises(InputError, match="no weights for v4 compact"):
         load_detector("", "cpu")
@@ -177,7 +177,7 @@ def test_an_exported_network_finds_the_same(tmp_path):
 
 
 @needs_onnx
-def test_export_writes_from_a_checkpoint_and_bad_files_are_refused(saved, tmp_path, monkeypatch):
+def test_export_reads_checkpoints_and_refuses_bad_files(saved, tmp_path, monkeypatch):
     path, _, _ = saved
     out = tmp_path / "o/w.onnx"
     done = CliRunner().invoke(cli, ["export", "onnx", str(path), "--out", str(out)])
@@ -262,13 +262,13 @@ def test_weights_are_imported_from_the_command_line(big, tmp_path):
 
 
 class Code:
-    """What weights_only must not run."""
+    """An object that runs code when unpickled, which weights_only must prevent."""
 
     def __reduce__(self):
         return print, ("run",)
 
 
-def test_files_that_hold_no_such_weights_are_refused(big, tmp_path, capsys):
+def test_files_with_other_content_are_refused(big, tmp_path, capsys):
     good = theirs(big, "OpenPCDet")
     points = "vfe.pfn_layers.0.linear.weight"
     cases = [({**good, "evil": Code()}, (), "weights only"), ({}, (), "no state_dict"),
