@@ -34,8 +34,8 @@ def compute_probabilities(models: Models, class_ids: np.ndarray, evidence: Evide
 
 def compute_max_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence,
                               source: str) -> np.ndarray:
-    """Return the highest probability (K,) float32 that each proposal can reach once the evidence of
-    `source` is added, whatever it says.
+    """Return the highest probability (K,) float32 that each proposal can reach for any evidence of
+    `source`.
 
     A curve is linear between its knots and constant beyond, so its maximum is at a knot or, without
     evidence, its value for unknown.
