@@ -21,6 +21,7 @@ from benchmark.graph import measure_graph, print_graph
 from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import print_ground, print_measured, print_planes
 from benchmark.simulation import measure_simulation
+from benchmark.startup import measure_startup
 from benchmark.timing import evenly_chosen
 from benchmark.tracking import measure_recording, print_tracking
 from lidar_perception.candidates.segmented_cloud import crop_to_view
@@ -103,6 +104,8 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
             print_tracking(drives)
     content["simulation"] = measure_simulation(count, repeat)
     print_measured(content["simulation"])
+    content["startup"] = measure_startup(repeat)
+    print_measured(content["startup"])
     if graph:
         content["graph"] = {name: measure_graph(recording, single)
                             for name, single in (("three_nodes", False), ("one_node", True))}

@@ -12,12 +12,13 @@ import torch
 from click.testing import CliRunner
 from samples import object_folder, scene, walker_label
 
-from benchmark import busy, ground, peers, plain_euclidean
+from benchmark import busy, ground, peers, plain_euclidean, startup
 from benchmark.clustering import dbscan_times, measure_dbscan, same_clusters
 from benchmark.detection import measure_detection, measure_engines, print_detection
 from benchmark.plain_pointnet2 import ball, farthest
 from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import print_ground, print_measured, row, target_text, value_text
+from benchmark.startup import measure_startup
 from benchmark.timing import Clock, in_child, interleaved
 from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import EuclideanParams
@@ -157,6 +158,16 @@ def test_a_frame_is_timed_beside_busy_processes(monkeypatch, capsys):
     assert "1 busy processes" in capsys.readouterr().out
     assert all(r["value"] > 0 for r in content["rows"]) and len(content["rows"]) == 3
     assert os.environ["GOMP_SPINCOUNT"] == "7" and "OMP_WAIT_POLICY" not in os.environ
+
+
+@pytest.mark.no_cover
+def test_start_is_measured_with_and_without_torch(monkeypatch, capsys):
+    monkeypatch.setattr(startup, "CODE", {"fused": "a = 0", "fused, engine torch": "import numpy",
+                                          "clustering": "a = 1"})
+    content = measure_startup(1, cold=("clustering",))
+    print_measured(json.loads(json.dumps(content)))
+    assert "compiled from nothing" in " ".join(capsys.readouterr().out.split())
+    assert content["rows"][0]["value"] > 1  # loading NumPy takes longer than loading nothing
 
 
 def test_the_cluster_network_is_timed_beside_a_plain_one(one_thread, capsys):

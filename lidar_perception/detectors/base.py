@@ -128,10 +128,11 @@ class NetworkDetector:
 
 
 def make_synthetic_frame(pose: SensorPoseParams) -> PointCloud:
-    """Return flat ground with one object on it, for the first run of a detector."""
+    """Return flat ground with two objects on it, one of them dense, for the first run."""
     rng = np.random.default_rng(0)
     ground = rng.uniform(0, 40, (2000, 3)) * [1, 1, 0.001] - [0, 20, SENSOR_HEIGHT]
     target = rng.uniform(-0.5, 0.5, (400, 3)) + [8, 0, -0.8]
-    xyz = np.concatenate([ground, target]).astype(np.float32)
+    dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 4, -0.8]  # DBSCAN has other code for these
+    xyz = np.concatenate([ground, target, dense]).astype(np.float32)
     xyz[:, 2] -= pose.height - SENSOR_HEIGHT
     return PointCloud(xyz, np.zeros(len(xyz), np.float32))

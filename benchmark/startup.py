@@ -1,0 +1,61 @@
+"""Start of a process that detects: CPU time and memory until the detector is ready, with compiled
+code in the cache, against the same with torch; and CPU time with an empty cache."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from benchmark.rows import measured, row
+
+CODE = {
+    "fused": "import lidar_perception; lidar_perception.load_detector(device='cpu')",
+    "fused, engine torch": "from lidar_perception.detectors.open import open_detector; "
+                           "open_detector(device='cpu', settings={'fused.engine': 'torch'})",
+    "clustering": "from lidar_perception.params import ClusteringNodeParams as P; "
+                  "from lidar_perception.candidates.warm_up import warm_up_clustering; "
+                  "warm_up_clustering(P().clustering, P().boxes)",
+    "ground segmentation": "from lidar_perception.params import GroundNodeParams as P; "
+                           "from lidar_perception.candidates.warm_up import warm_up_ground; "
+                           "warm_up_ground(P().ground)"}
+PRINT = """
+import resource
+usage = resource.getrusage(resource.RUSAGE_SELF)
+status = open('/proc/self/status').read()
+print(usage.ru_utime + usage.ru_stime, int(status.split('VmHWM:')[1].split()[0]) / 1024)
+"""
+WITH_TORCH = "fused, engine torch"
+
+
+def measure_startup(repeat: int, cold: tuple[str, ...] = ("fused", "clustering")) -> dict:
+    """Measure start-ups.
+
+    Args:
+        cold: names in CODE that are also compiled from nothing, which takes a minute or more.
+    """
+    runs = {name: np.median([_start(code) for _ in range(repeat)], axis=0)
+            for name, code in CODE.items()}
+    rows = [row(WITH_TORCH, peer_ms=1e3 * runs[WITH_TORCH][0], ours_ms=1e3 * runs["fused"][0],
+                value=runs[WITH_TORCH][0] / runs["fused"][0])]
+    rows += [row(f"{name}, peak memory", value=memory, unit="MB")
+             for name, (_, memory) in runs.items()]
+    for name in cold:
+        with tempfile.TemporaryDirectory() as folder:
+            seconds, _ = _start(CODE[name], NUMBA_CACHE_DIR=folder)
+        rows.append(row(f"{name}, compiled from nothing", ours_ms=1e3 * seconds))
+    title = f"Start of a process, CPU ms at a load of {os.getloadavg()[0]:.1f}"
+    return measured(title, repeat, 0, rows)
+
+
+def _start(code: str, **variables: str) -> tuple[float, float]:
+    """Return CPU seconds and peak memory in MB of a process that runs some code."""
+    done = subprocess.run([sys.executable, "-c", code + PRINT], text=True, check=True,
+                          capture_output=True, env={**os.environ, **variables},
+                          cwd=Path(__file__).resolve().parents[1])
+    seconds, memory = map(float, done.stdout.split())
+    return seconds, memory
