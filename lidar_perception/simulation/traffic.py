@@ -9,7 +9,12 @@ import numpy as np
 from lidar_perception.simulation.actors import SIGHT_M, Actor, Room
 from lidar_perception.simulation.crowd import place_standing, place_walking
 from lidar_perception.simulation.places import Side, scatter
-from lidar_perception.simulation.shapes.cyclists import make_bicycle, make_cyclist, make_motorcycle
+from lidar_perception.simulation.shapes.cyclists import (
+    make_bicycle,
+    make_cyclist,
+    make_motorcycle,
+    make_motorcyclist,
+)
 from lidar_perception.simulation.shapes.furniture import make_bench
 from lidar_perception.simulation.shapes.heavy_vehicles import make_bus, make_tram, make_truck
 from lidar_perception.simulation.shapes.people import make_sitting_person
@@ -27,6 +32,7 @@ from lidar_perception.simulation.street import (
 DRAWBAR_M = 0.8  # between a car and its trailer
 FREE_CORNER_M = 5.0  # without parked vehicles, at a crossing
 OTHER_VEHICLE = 20  # SemanticKITTI class
+MOTORCYCLIST_SHARE = 0.3  # of the riders at the edges of the road
 
 
 def populate(rng: np.random.Generator, street: Street, room: Room, people: float) -> None:
@@ -180,7 +186,7 @@ def _place_seats(rng, side: Side, rate: float, people: float) -> Iterator[list[A
 
 
 def _place_riders(rng, street: Street, seconds: float, people: float) -> Iterator[Actor]:
-    """Yield cyclists at the edges of the road, on sidewalks and crossings, and parked bicycles."""
+    """Yield riders at the edges of the road, on sidewalks and crossings, and parked bicycles."""
     ground, kind = street.ground, street.kind
     lanes = [lane for lane in street.lanes if lane.use == "cycle"]
     places = [(lane.y, lane.direction) for lane in lanes] or [
@@ -191,7 +197,8 @@ def _place_riders(rng, street: Street, seconds: float, people: float) -> Iterato
         first = street.start - (street.speed * seconds if way > 0 else 0.0)
         for x in first + scatter(rng, street.end - first, kind.riders * people
                                  * (2.0 if lanes else 1.0)):
-            yield Actor(make_cyclist(rng), x, y + rng.normal(0, 0.1), np.pi * (way < 0),
+            make = make_motorcyclist if rng.random() < MOTORCYCLIST_SHARE else make_cyclist
+            yield Actor(make(rng), x, y + rng.normal(0, 0.1), np.pi * (way < 0),
                         speed * rng.uniform(0.95, 1.05))
     for side in (*street.blocks, *_find_crosswalks(street)):
         for along in scatter(rng, side.length, kind.riders * people * 0.5):

@@ -33,7 +33,8 @@ LABELLED = {
     "backpack": (partial(people.make_pedestrian, speed=1.2, carried="backpack"), 16),
     "sitting": (people.make_sitting_person, 18),
     "on bench": (partial(people.make_sitting_person, chair=False), 16),
-    "cyclist": (cyclists.make_cyclist, 20), "car": (vehicles.make_car, 34),
+    "cyclist": (cyclists.make_cyclist, 20), "motorcyclist": (cyclists.make_motorcyclist, 24),
+    "car": (vehicles.make_car, 34),
     "parked": (partial(vehicles.make_car, driver=False), 34), "van": (vehicles.make_van, 34),
     "truck": (heavy_vehicles.make_truck, 32), "bus": (heavy_vehicles.make_bus, 32),
     "tram": (heavy_vehicles.make_tram, 32)}
@@ -46,7 +47,7 @@ SCENERY = {
         furniture.make_fence, furniture.make_wall, vegetation.make_hedge)},
     "building": (partial(buildings.make_building, length=15.0, depth=10.0, storeys=4), 40),
     "cottage": (partial(buildings.make_building, length=6.0, depth=8.0, storeys=1), 40)}
-SEMANTICS = {10, 11, 15, 16, 18, 20, 30, 31, 50, 51, 70, 71, 80, 81, 99}
+SEMANTICS = {10, 11, 15, 16, 18, 20, 30, 31, 32, 50, 51, 70, 71, 80, 81, 99}
 
 
 def make_parts(make, seed):

@@ -1,4 +1,4 @@
-"""Cyclists, and bicycles and motorcycles without a rider."""
+"""Riders of bicycles and motorcycles, and both without a rider."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from lidar_perception.simulation.shapes.thing import (
     block,
     disc,
     draw_size,
+    make_rigid,
     rod,
 )
-from lidar_perception.simulation.solids import BOX, ELLIPSOID, part, parts
+from lidar_perception.simulation.solids import BOX, ELLIPSOID, compute_extents, part, parts
 
-BICYCLE, MOTORCYCLE, BICYCLIST = 11, 15, 31
+BICYCLE, MOTORCYCLE, BICYCLIST, MOTORCYCLIST = 11, 15, 31, 32
 CRANK_M, GEAR_M = 0.17, 5.0  # length of a crank, distance per turn of the cranks
 SPOKE_TRANSMISSION = 0.5            # share of the beams that pass between the spokes
 FRAME_TRANSMISSION = 0.6  # between stays, chain and pedals, and through the rack
@@ -137,10 +138,14 @@ def make_bicycle(rng: np.random.Generator) -> np.ndarray:
 
 def make_motorcycle(rng: np.random.Generator) -> np.ndarray:
     """Make a parked motorcycle or scooter (P,) PART."""
-    length, paint = rng.uniform(1.8, 2.2), rng.uniform(0.05, 0.5)
-    radius = rng.uniform(0.25, 0.31)
+    return parts(_motorcycle_parts(rng.uniform(1.8, 2.2), rng.uniform(0.05, 0.5),
+                             rng.uniform(0.25, 0.31)), MOTORCYCLE)
+
+
+def _motorcycle_parts(length: float, paint: float, radius: float) -> list[tuple]:
+    """Return the rows of a motorcycle; radius: of the wheels, in metres."""
     axle = length / 2 - radius
-    rows = [disc((-axle, 0, radius), radius, 0.07, reflectance=RUBBER),
+    return [disc((-axle, 0, radius), radius, 0.07, reflectance=RUBBER),
             disc((axle, 0, radius), radius, 0.06, reflectance=RUBBER),
             part(ELLIPSOID, (0, 0, 0.5), (0.45, 0.18, 0.28), reflectance=paint),
             part(ELLIPSOID, (-0.45, 0, 0.78), (0.4, 0.15, 0.09), reflectance=RUBBER),
@@ -149,4 +154,31 @@ def make_motorcycle(rng: np.random.Generator) -> np.ndarray:
             rod((axle - 0.3, -0.36, 1.02), (axle - 0.3, 0.36, 1.02), 0.02, reflectance=METAL),
             block((-length / 2 + 0.05, -0.1, 0.55), (-length / 2 + 0.07, 0.1, 0.7),
                   reflectance=PLATE)]
-    return parts(rows, MOTORCYCLE)
+
+
+def make_motorcyclist(rng: np.random.Generator) -> Thing:
+    """Make a rider of a motorcycle or scooter, labelled as a cyclist; some have a passenger."""
+    length, trunk = rng.uniform(1.7, 2.15), rng.uniform(0.52, 0.62)  # hip to the base of the neck
+    rows = _motorcycle_parts(length, rng.uniform(0.05, 0.6), rng.uniform(0.2, 0.31))
+    lean, bar = rng.uniform(0.05, 0.4), length / 2 - 0.55
+    riders = [bar - rng.uniform(0.45, 0.6)]
+    if rng.random() < 0.2:
+        riders.append(riders[0] - 0.38)
+    for hip in riders:
+        coat, trousers, helmet = rng.uniform((0.15, 0.1, 0.1), (0.85, 0.7, 0.8))
+        shoulder = (hip + sin(lean) * trunk, 0.82 + cos(lean) * trunk)
+        head = (shoulder[0] + 0.04, 0.0, shoulder[1] + 0.17)
+        rows += [part(ELLIPSOID, ((hip + shoulder[0]) / 2, 0.0, (0.82 + shoulder[1]) / 2),
+                      (0.14, 0.21, 0.6 * trunk), pitch=lean, reflectance=coat),
+                 part(ELLIPSOID, head, (0.14, 0.12, 0.14), reflectance=helmet)]
+        for side in (-1, 1):
+            knee_x, foot = hip + 0.42, (hip + 0.3, side * 0.2, 0.3)
+            rows += [rod((hip, side * 0.1, 0.82), (knee_x, side * 0.2, 0.74), 0.085,
+                         reflectance=trousers),
+                     rod((knee_x, side * 0.2, 0.74), foot, 0.06, reflectance=trousers),
+                     rod((shoulder[0], side * 0.19, shoulder[1] - 0.05),
+                         (min(bar, shoulder[0] + 0.55), side * 0.3, 1.0), 0.05, reflectance=coat)]
+    made = parts(rows, MOTORCYCLIST)
+    _, high = compute_extents(made)
+    size = (length, 2 * float(high[:, 1].max()), float(high[:, 2].max()))
+    return make_rigid(made, size, CLASSES[CYCLIST])
