@@ -86,24 +86,35 @@ def normalize_intensity(intensity: np.ndarray | None) -> np.ndarray | None:
         intensity: (N,) intensities, NaN for unknown ones, or None.
 
     Returns:
-        (N,) float32; None if there is no usable intensity: none at all, fewer than MIN_KNOWN of
-        them positive, or nearly all positive ones equal.
+        (N,) float32; None without a usable intensity, see has_usable_intensity.
     """
-    if intensity is None:
+    if intensity is None or not has_usable_intensity(intensity):
         return None
     positive = intensity > 0
     values = intensity[positive]
-    if len(values) <= MIN_KNOWN * len(intensity):
-        return None
     knots = np.quantile(values, REFERENCE_SHARES)
-    if knots[REFERENCE_SHARES.index(0.1)] >= knots[REFERENCE_SHARES.index(0.9)]:
-        return None
     # Of equal knots, the middle one counts: np.interp needs them to rise.
     unique, inverse = np.unique(knots, return_inverse=True)
     middles = np.bincount(inverse, REFERENCE_VALUES) / np.bincount(inverse)
     normalized = np.where(np.isnan(intensity), intensity, np.float32(0)).astype(np.float32)
     normalized[positive] = np.interp(values, unique, middles)
     return normalized
+
+
+def has_usable_intensity(intensity: np.ndarray | None) -> bool:
+    """Return True if networks can read the intensities (N,) of a cloud.
+
+    They cannot if there are none, if fewer than MIN_KNOWN of them are positive, or if nearly all
+    positive ones are equal.
+    """
+    if intensity is None:
+        return False
+    sample = intensity[::max(1, len(intensity) // WHOLE_SAMPLE)]
+    positive = sample[sample > 0]
+    if len(positive) <= MIN_KNOWN * len(sample):
+        return False
+    low, high = np.quantile(positive, (0.1, 0.9))
+    return bool(low < high)
 
 
 class StreamScale:

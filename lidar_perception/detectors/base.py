@@ -135,4 +135,4 @@ def make_synthetic_frame(pose: SensorPoseParams) -> PointCloud:
     dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 4, -0.8]  # DBSCAN has other code for these
     xyz = np.concatenate([ground, target, dense]).astype(np.float32)
     xyz[:, 2] -= pose.height - SENSOR_HEIGHT
-    return PointCloud(xyz, np.zeros(len(xyz), np.float32))
+    return PointCloud(xyz, rng.uniform(0.1, 0.9, len(xyz)).astype(np.float32))

@@ -25,13 +25,18 @@ from lidar_perception.detectors.boxes import (
 )
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.devices import CPU
-from lidar_perception.detectors.fused.detector import FusedDetector, remove_duplicates
+from lidar_perception.detectors.fused.detector import (
+    FusedDetector,
+    load_fused_detector,
+    remove_duplicates,
+)
 from lidar_perception.detectors.fused.evidence import MIN_PROBABILITY, to_log_odds
 from lidar_perception.detectors.fused.fusion import KNOTS, load_shipped_models
 from lidar_perception.detectors.fused.model import compute_max_probabilities, compute_probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.normalized_view import drop_ego_vehicle
 from lidar_perception.detectors.pointnet import classifier
+from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
 from lidar_perception.detectors.trained_network import Placement
 from lidar_perception.geometry import bev_iou, points_in_box, points_in_boxes, wrap_angle
 from lidar_perception.ground.surface import MIN_POINTS, fit_ground_heights
@@ -42,6 +47,7 @@ from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, 
 pytestmark = [pytest.mark.no_cover,
               pytest.mark.usefixtures("one_thread")]
 SEEDS = st.integers(0, 2**32 - 1)
+EAGER = FusedDetectorParams(fused=FusedParams(warm_up=False))
 
 
 def random_boxes(rng, count: int) -> np.ndarray:
@@ -308,3 +314,23 @@ def test_parameters_can_change_between_clouds(detector):
     other.params = with_values(detector.params, {"fused.proposals": 0.6})
     assert len(other(frame()).detections) < len(detector(frame()).detections)
     assert same(detector(frame()), detector(frame()))
+
+
+def test_cloud_without_intensity_goes_to_own_networks():
+    detector = load_fused_detector("", "cpu", EAGER)
+    blind = detector.load_blind("ahead")
+    assert blind.load_blind is None and blind.warning is None
+    assert blind.classes == detector.classes and detector.load_blind("ahead") is blind
+    scan = frame()
+    without = replace(scan, intensity=None)
+    assert same(detector(without), blind(without))
+    assert same(detector(replace(scan, intensity=np.full_like(scan.intensity, 0.3))),
+                blind(without))
+    off = detector.with_params(with_values(detector.params, {"fused.use_intensity": False}))
+    assert same(off(scan), blind(without))
+    around = detector.with_range("around")
+    assert same(around(without), around.load_blind("around")(without))
+    low = detector.with_min_score(0.01)
+    assert len(low(without).detections) >= len(detector(without).detections)
+    own = load_fused_detector(WEIGHTS / "pointpillars_v0_compact.safetensors", "cpu", EAGER)
+    assert own.load_blind is None  # networks of the user see every cloud

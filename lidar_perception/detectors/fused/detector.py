@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
@@ -21,7 +23,14 @@ from lidar_perception.detectors.fused.evidence import (
     find_silhouette_confidence,
     to_log_odds,
 )
-from lidar_perception.detectors.fused.fusion import Models, find_fusion, load_shipped_models
+from lidar_perception.detectors.fused.fusion import (
+    NO_INTENSITY,
+    Fusion,
+    Models,
+    find_fusion,
+    load_shipped_models,
+    read_fusion,
+)
 from lidar_perception.detectors.fused.model import (
     compute_max_probabilities,
     compute_probabilities,
@@ -46,6 +55,7 @@ from lidar_perception.detectors.pointpillars.proposer import PointPillarsPropose
 from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.geometry import bev_iou, centre_distances
 from lidar_perception.ground.surface import fit_ground_heights
+from lidar_perception.intensity import has_usable_intensity
 from lidar_perception.types import CLASSES, Detections, PointCloud
 
 
@@ -77,6 +87,8 @@ class FusedDetector(NetworkDetector):
         proposer, classifier: the networks. The curves of `models` were fitted to the proposer's
             raw scores.
         models: curves that turn evidence into probabilities; None: the shipped ones.
+        load_blind: loads the detector, of a range, for clouds without usable intensity; None: this
+            one detects in them, too.
     """
 
     group = "fused"
@@ -84,8 +96,10 @@ class FusedDetector(NetworkDetector):
 
     def __init__(self, proposer: PointPillarsProposer, classifier: PointNetClassifier,
                  params: FusedDetectorParams = FusedDetectorParams(),
-                 models: Models | None = None, warning: str | None = None):
+                 models: Models | None = None, warning: str | None = None,
+                 load_blind: Callable[[str], FusedDetector] | None = None):
         super().__init__(params, warning)
+        self.load_blind = load_blind
         self.proposer, self.classifier = proposer.with_raw_scores(), classifier
         self.models = load_shipped_models() if models is None else models
 
@@ -108,6 +122,10 @@ class FusedDetector(NetworkDetector):
 
     def detect(self, frame: PointCloud, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> DetectionResult:
+        if self.load_blind is not None and not (self.settings.use_intensity
+                                                and has_usable_intensity(frame.intensity)):
+            return self.load_blind(self.range).with_params(self.params).detect(frame, ground,
+                                                                               cluster_ids)
         proposals = self.propose(frame, ground, cluster_ids, self.settings.scores)
         begin = perf_counter()
         detections, best = self.decide(proposals)
@@ -212,8 +230,23 @@ def load_fused_detector(path: str | Path = "", device: str = "auto",
     Raises:
         InputError: see find_fusion, load_detector and load_pointnet_detector.
     """
+    fusion = find_fusion(path, params.fused)
+    detector = _load_fusion(fusion, device, params)
+    if fusion == find_fusion():
+        detector.load_blind = cache(partial(_load_blind, str(detector.device), params))
+    if params.fused.warm_up:
+        detector.warm_up()
+    return detector
+
+
+def _load_blind(device: str, params: FusedDetectorParams, range: str) -> FusedDetector:
+    """Load the shipped detector for clouds without usable intensity."""
+    own = replace(params, fused=replace(params.fused, range=range))
+    return _load_fusion(read_fusion(NO_INTENSITY), device, own)
+
+
+def _load_fusion(fusion: Fusion, device: str, params: FusedDetectorParams) -> FusedDetector:
     settings = params.fused
-    fusion = find_fusion(path, settings)
     proposer = load_detector(fusion.proposer, device, DetectorParams(
         pointpillars=PointPillarsParams(range=settings.range, amp=settings.amp, warm_up=False,
                                         threads=settings.threads, engine=settings.engine,
@@ -222,8 +255,5 @@ def load_fused_detector(path: str | Path = "", device: str = "auto",
         pointnet=PointNetParams(warm_up=False, cpu_fallback=settings.cpu_fallback,
                                 engine="torch" if settings.engine == "torch" else "auto"))
     ).classifier
-    detector = FusedDetector(proposer, classifier, params, fusion.models,
-                             "; ".join(fusion.find_warnings(proposer.classes)) or None)
-    if settings.warm_up:
-        detector.warm_up()
-    return detector
+    return FusedDetector(proposer, classifier, params, fusion.models,
+                         "; ".join(fusion.find_warnings(proposer.classes)) or None)

@@ -28,6 +28,7 @@ from lidar_perception.runs.files import read_text, shorten_error, write_text
 from lidar_perception.types import InputError
 
 PACKAGE = Path(__file__).with_name("fusion.json")
+NO_INTENSITY = PACKAGE.with_name("fusion_no_intensity.json")  # for clouds without intensity
 SUFFIX = ".json"        # distinguishes a fusion file from a checkpoint
 MAX_BYTES = 10**6
 MAX_LOG_ODDS = 1000.0
