@@ -1,6 +1,8 @@
-"""lidar benchmark: our candidate pipeline beside a plain reading of paper A, each algorithm beside
-its peers, every version of EG-PointPillars, and the graph of nodes over DDS, in one run on one
-machine."""
+"""lidar benchmark: all algorithms against their peers, in one run on one machine.
+
+The candidate pipeline against a plain implementation of paper A, each algorithm against its peers,
+every version of EG-PointPillars, and the graph of nodes over DDS.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import print_ground, print_measured, print_planes
 from benchmark.simulation import measure_simulation
 from benchmark.startup import measure_startup
-from benchmark.timing import evenly_chosen
+from benchmark.timing import choose_evenly
 from benchmark.tracking import measure_recording, print_tracking
 from lidar_perception.candidates.segmented_cloud import crop_to_view
 from lidar_perception.candidates.warm_up import warm_up
@@ -50,15 +52,15 @@ FEW = 3              # frames with a pedestrian, below which those without serve
 @click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
               help="Write the figures to this file.")
 @click.option("--repeat", type=click.IntRange(1), default=5, show_default=True,
-              help="Runs a frame; its time is the median. Fewer beside peers that take seconds.")
+              help="Runs a frame; its time is the median. Fewer for slow peers.")
 @click.option("--frames", "count", type=click.IntRange(1), default=8, show_default=True,
               help="Frames for the single algorithms, evenly spread over the folder.")
 @click.option("--graph/--no-graph", default=True, show_default=True,
               help="Also replay a bag of the frames through the nodes at 10 Hz.")
 def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int,
          graph: bool) -> None:
-    """Time our candidate pipeline beside a plain scikit-learn + OpenCV reading of the paper, and
-    each algorithm beside its peers, and the steps of every version of EG-PointPillars and of the
+    """Time our candidate pipeline and a plain scikit-learn + OpenCV implementation of the paper,
+    each algorithm and its peers, and the steps of every version of EG-PointPillars and of the
     PointNet detector. Peers that are not installed are left out.
 
     \b
@@ -74,7 +76,7 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     if not frames:
         raise InputError(f"{recording.path} has no frame with a Pedestrian label")
     labelled = [f for each in recordings if POINT_LABELS in each.has
-                for f in evenly_chosen(each.frames, count)]
+                for f in choose_evenly(each.frames, count)]
     warm_up()
     content: dict[str, Any] = {"machine": {"cpu": read_cpu_name(), "cores": os.cpu_count(),
                                            "python":
@@ -115,18 +117,18 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
 
 
 def _with_camera(recording: Recording, pedestrian: list[Frame], count: int) -> list[tuple]:
-    """(scan, camera) of the frames with a pedestrian; of any frames where these are few."""
+    """Return (scan, camera) of frames with a pedestrian, or of any frames if these are few."""
     chosen = pedestrian if len(pedestrian) >= FEW else recording.frames
-    return [(f.load(), f.camera()) for f in evenly_chosen(chosen, count)]
+    return [(f.load(), f.camera()) for f in choose_evenly(chosen, count)]
 
 
 def _full_scans(recording: Recording, count: int) -> list[PointCloud]:
     whole = [f for f in recording if len(f.load()) > FULL_SCAN]
-    return [f.load() for f in evenly_chosen(whole, count)]
+    return [f.load() for f in choose_evenly(whole, count)]
 
 
 def _measure(in_view: list[np.ndarray], scans: list[PointCloud], repeat: int) -> dict:
-    """Each algorithm beside its peers, printed one after the other."""
+    """Measure and print each algorithm and its peers."""
     whole = [f.xyz for f in scans]
     near, far, rest = ([xyz.compress(~segment(xyz), axis=0) for xyz in clouds]
                        for clouds, segment in ((in_view, segment_by_threshold),
@@ -145,7 +147,7 @@ def _measure(in_view: list[np.ndarray], scans: list[PointCloud], repeat: int) ->
         errors.print(f"no scan has more than {FULL_SCAN} points: whole scans are not measured")
         return content
     dbscan = clustering.measure_dbscan("DBSCAN, whole scan", far, repeat, 20)
-    clustering.whole_scan_limits(dbscan, far)
+    clustering.add_limits(dbscan, far)
     show("dbscan_whole_scan", dbscan)
     for threshold in ("global", "local"):
         show(f"euclidean_{threshold}", clustering.measure_euclidean(rest, threshold, repeat))

@@ -1,6 +1,8 @@
-"""PointPillars v4 compact while other programs want the cores too: torch's threads soon asleep
-while they wait for work, as our nodes and commands have it (runs/threads.py), beside torch's own
-way."""
+"""PointPillars v4 compact on a machine that is busy with other programs.
+
+Compares threads of torch that sleep early, as in our nodes and commands (runs/threads.py), with
+torch's default.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from time import perf_counter
 
 import numpy as np
 
-from benchmark.rows import measured, row
+from benchmark.rows import make_measurement, make_row
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.runs.memory import keep_freed_memory
 from lidar_perception.runs.terminal import show_progress
@@ -27,35 +29,43 @@ WAYS = {"ours": PASSIVE_WAITING, "torch's": {}}
 
 
 def measure_busy(scans: list[PointCloud], repeat: int) -> dict:
-    """ms a frame, without and beside BUSY busy processes, taken in turn."""
-    title = f"PointPillars v4 compact beside {BUSY} busy processes"
+    """Measure ms per frame, without and with BUSY busy processes, in turn."""
+    title = f"PointPillars v4 compact with {BUSY} busy processes"
     ms: dict[tuple[str, int], list[float]] = {(way, n): [] for way in WAYS for n in (0, BUSY)}
     with ExitStack() as stack:
-        workers = {way: stack.enter_context(_worker(environment, scans))
+        workers = {way: stack.enter_context(_start_worker(environment, scans))
                    for way, environment in WAYS.items()}
         for _ in show_progress(range(repeat), title, repeat):
             for busy in (0, BUSY):
-                with _beside(busy):
+                with _run_busy_processes(busy):
                     for way, worker in workers.items():
-                        ms[way, busy] += worker.submit(_times).result()
+                        ms[way, busy] += worker.submit(_measure_times).result()
     median = {key: float(np.median(values)) for key, values in ms.items()}
-    rows = [row(f"torch's own threads, {busy} busy processes", peer_ms=median["torch's", busy],
-                ours_ms=median["ours", busy], value=median["torch's", busy] / median["ours", busy])
-            for busy in (0, BUSY)]
-    rows.append(row(f"(ours, {BUSY} busy processes to none)", unit="",
-                    value=median["ours", BUSY] / median["ours", 0]))
-    return measured(title, len(scans), np.median([len(scan) for scan in scans]), rows)
+    rows = [
+        make_row(
+            f"torch's own threads, {busy} busy processes",
+            peer_ms=median["torch's", busy],
+            ours_ms=median["ours", busy],
+            value=median["torch's", busy] / median["ours", busy],
+        )
+        for busy in (0, BUSY)
+    ]
+    rows.append(make_row(f"(ours, {BUSY} busy processes to none)", unit="",
+                         value=median["ours", BUSY] / median["ours", 0]))
+    return make_measurement(title, len(scans), np.median([len(scan) for scan in scans]), rows)
 
 
 @contextmanager
-def _worker(environment: dict[str, str], scans: list[PointCloud]) -> Iterator[ProcessPoolExecutor]:
-    """A process that has loaded torch in this environment."""
+def _start_worker(
+    environment: dict[str, str], scans: list[PointCloud]
+) -> Iterator[ProcessPoolExecutor]:
+    """Start a process that has loaded torch in this environment."""
     before = {name: os.environ.pop(name, None) for name in PASSIVE_WAITING}
     os.environ.update(environment)
     try:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"),
                                  initializer=_prepare, initargs=(scans,)) as worker:
-            worker.submit(_times).result()
+            worker.submit(_measure_times).result()
             yield worker
     finally:
         for name, value in before.items():
@@ -73,8 +83,8 @@ def _prepare(scans: list[PointCloud]) -> None:
     _ready.update(detector=open_detector("pointpillars"), scans=scans)
 
 
-def _times() -> list[float]:
-    """ms of each scan."""
+def _measure_times() -> list[float]:
+    """Return the ms of each scan."""
     found = []
     for scan in _ready["scans"]:
         begin = perf_counter()
@@ -84,8 +94,8 @@ def _times() -> list[float]:
 
 
 @contextmanager
-def _beside(count: int) -> Iterator[None]:
-    """While so many processes count without end."""
+def _run_busy_processes(count: int) -> Iterator[None]:
+    """Run the given number of busy processes meanwhile."""
     others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
     try:
         yield

@@ -1,4 +1,4 @@
-"""Our candidate pipeline beside a plain reading of paper A."""
+"""The candidate pipeline against a plain implementation of paper A."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SAME = 0.02  # metres between boxes of the same candidate; planes of two RANSACs
 
 
 def compare_candidates(frames: list[Frame], repeat: int) -> dict:
-    """Medians over the frames of both, and how far their results agree."""
+    """Return the median times of both, and how well their results agree."""
     ours: dict[str, list[float]] = {}
     plain: dict[str, list[float]] = {}
     best: dict[str, list[float]] = {}
@@ -45,11 +45,14 @@ def compare_candidates(frames: list[Frame], repeat: int) -> dict:
                                    boxes)
         found = refine_segmented(segmented, make_truth_source(truth), PAPER)
         agree["candidates_same_given_ground"] += all(
-            len(getattr(found, s)) == len(result[s]) == _shared(getattr(found, s).boxes, result[s])
-            for s in STAGES)
+            len(getattr(found, s))
+            == len(result[s])
+            == _count_shared(getattr(found, s).boxes, result[s])
+            for s in STAGES
+        )
         # Each with its own RANSAC.
         agree["candidates"] += max(len(mine[0][1].final), len(result["final"]))
-        agree["candidates_same"] += _shared(mine[0][1].final.boxes, result["final"])
+        agree["candidates_same"] += _count_shared(mine[0][1].final.boxes, result["final"])
     medians = {name: {k: float(np.median(v)) for k, v in steps.items()}
                for name, steps in (("ours_ms", ours), ("plain_ms", plain), ("best_ms", best))}
     ratios = {k: medians["plain_ms"][k] / medians["ours_ms"][k] for k in medians["plain_ms"]}
@@ -63,15 +66,15 @@ def _median_of_steps(times: dict[str, list[float]], runs: list[dict[str, float]]
         times.setdefault(step, []).append(float(np.median([run[step] for run in runs])))
 
 
-def _shared(a: np.ndarray, b: np.ndarray) -> int:
-    """How many boxes of a have one in b within SAME metres in every number."""
+def _count_shared(a: np.ndarray, b: np.ndarray) -> int:
+    """Count the boxes of a that have one in b within SAME metres in every value."""
     if len(a) == 0 or len(b) == 0:
         return 0
     return int((np.abs(a[:, None] - b[None]).max(axis=2) <= SAME).any(axis=1).sum())
 
 
 def print_comparison(content: dict) -> None:
-    table = Table(title="Median ms a frame: plain reading of the paper, and ours")
+    table = Table(title="Median ms per frame: plain implementation of the paper, and ours")
     for name in ("step", "plain", "ours", "times faster", "ours, best"):
         table.add_column(name, justify="left" if name == "step" else "right")
     for step, best in content["best_ms"].items():

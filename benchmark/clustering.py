@@ -1,5 +1,7 @@
-"""Clustering beside its peers. Clouds are points (N, 3) float32 that are not ground, unless a
-function says otherwise."""
+"""Clustering against its peers.
+
+Clouds are points (N, 3) float32 without ground, unless a function says otherwise.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,8 @@ from scipy.spatial import cKDTree
 
 from benchmark import peers, plain_euclidean
 from benchmark.memory import METHOD, dbscan_memory
-from benchmark.rows import against, measured, row, with_target
-from benchmark.timing import SLOW_REPEAT, Clock, evenly_chosen, in_child, thin
+from benchmark.rows import add_target, compute_speedup, make_measurement, make_row
+from benchmark.timing import SLOW_REPEAT, Clock, choose_evenly, run_in_child, thin
 from lidar_perception.clustering.dbscan import distance_aware_dbscan
 from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import DbscanParams, EuclideanParams
@@ -23,30 +25,39 @@ PLAIN = "SciPy and NumPy"
 
 
 def measure_dbscan(title: str, clouds: list[np.ndarray], repeat: int, target: float) -> dict:
-    """Ours beside the DBSCANs of peers.py, with paper A's bands. The target is against the faster
-    of scikit-learn's two; the labels must be scikit-learn's, border points included, and of the
-    others noise and the partition of the core points must be the same."""
+    """Measure our DBSCAN and those of peers.py, with paper A's bands.
+
+    The target refers to the faster of scikit-learn's two. Labels must equal scikit-learn's, border
+    points included; for the other peers noise and the partition of the core points must be equal.
+    """
     here = [p for p in peers.DBSCANS if not p.missing()]
-    rows = {p.name: row(p.name, note=p.missing()) for p in peers.DBSCANS}
+    rows = {p.name: make_row(p.name, note=p.missing()) for p in peers.DBSCANS}
     ms: dict[str, float] = {}
-    for group, run in (([p for p in here if p != peers.WHEEL], dbscan_times),
-                       ([p for p in here if p == peers.WHEEL], partial(in_child, dbscan_times))):
+    for group, run in (
+        ([p for p in here if p != peers.WHEEL], measure_dbscans),
+        ([p for p in here if p == peers.WHEEL], partial(run_in_child, measure_dbscans)),
+    ):
         if group:
             times, same, differ = run([peers.DBSCANS.index(p) for p in group], clouds, repeat,
                                       title)
             ms |= times
-            rows |= {p.name: against(p.name, times, None, same[p.name], differ[p.name])
+            rows |= {p.name: compute_speedup(p.name, times, None, same[p.name], differ[p.name])
                      for p in group}
     faster = min((p.name for p in peers.SKLEARN), key=lambda name: ms[name])
-    rows[faster] = with_target(rows[faster], target)
-    return measured(title, len(clouds), np.median([len(c) for c in clouds]), list(rows.values()))
+    rows[faster] = add_target(rows[faster], target)
+    return make_measurement(
+        title, len(clouds), np.median([len(c) for c in clouds]), list(rows.values())
+    )
 
 
-def dbscan_times(chosen: list[int], clouds: list[np.ndarray], repeat: int,
-                 title: str) -> tuple[dict, Counter, Counter]:
-    """Medians of ours and of the chosen of peers.DBSCANS (their indices, which a child process can
-    be told), in how many clouds their results are the same, and how many points are noise for one
-    and not for the other."""
+def measure_dbscans(chosen: list[int], clouds: list[np.ndarray], repeat: int,
+                    title: str) -> tuple[dict, Counter, Counter]:
+    """Measure our DBSCAN and the chosen peers.
+
+    chosen are indices into peers.DBSCANS, which can be sent to a child process. Returns median
+    times, the number of clouds with equal results, and the number of points that only one of the
+    two calls noise.
+    """
     group = [peers.DBSCANS[i] for i in chosen]
 
     def calls(xyz):
@@ -58,32 +69,33 @@ def dbscan_times(chosen: list[int], clouds: list[np.ndarray], repeat: int,
     differ: Counter[str] = Counter()
     for xyz in show_progress(clouds, title, len(clouds)):
         found = clock.time(calls(xyz))
-        ours, core = found["ours"], core_points(xyz)
+        ours, core = found["ours"], find_core_points(xyz)
         for p in group:
             theirs = found[p.name]
             same[p.name] += (np.array_equal(theirs, ours) if p in peers.SKLEARN
-                             else same_clusters(theirs, ours, core))
+                             else have_same_clusters(theirs, ours, core))
             differ[p.name] += int(((theirs == 0) != (ours == 0)).sum())
     return clock.medians(), same, differ
 
 
-def whole_scan_limits(content: dict, clouds: list[np.ndarray]) -> None:
-    """Adds to the rows of measure_dbscan on whole scans: its time, and the memory on the largest
-    cloud."""
+def add_limits(content: dict, clouds: list[np.ndarray]) -> None:
+    """Add rows to measure_dbscan on whole scans: time, and memory on the largest cloud."""
     ms = content["rows"][0]["ours_ms"]
-    content["rows"].append(row("(time)", ours_ms=ms, value=ms, unit="ms", target=60))
+    content["rows"].append(make_row("(time)", ours_ms=ms, value=ms, unit="ms", target=60))
     memory = dbscan_memory(max(clouds, key=len))
-    content["rows"].append(row("(memory, largest)", value=memory, unit="MB", target=200,
-                               note="" if memory is not None else "not measured"))
+    content["rows"].append(make_row("(memory, largest)", value=memory, unit="MB", target=200,
+                                    note="" if memory is not None else "not measured"))
     content["memory_method"] = METHOD
 
 
 def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> dict:
-    """Ours beside plain_euclidean. The peer takes seconds with the local threshold: half the
-    frames then."""
+    """Measure our Euclidean clustering and plain_euclidean.
+
+    The peer takes seconds with the local threshold, so it runs on half of the frames.
+    """
     params = EuclideanParams(threshold=threshold)
     if threshold == "local":
-        clouds, repeat = evenly_chosen(clouds, (len(clouds) + 1) // 2), min(repeat, SLOW_REPEAT)
+        clouds, repeat = choose_evenly(clouds, (len(clouds) + 1) // 2), min(repeat, SLOW_REPEAT)
 
     def calls(xyz):
         return {PLAIN: partial(plain_euclidean.euclidean, xyz, params),
@@ -93,13 +105,13 @@ def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> 
     clock, same = Clock(repeat, calls(thin(clouds[0]))), 0
     for xyz in show_progress(clouds, title, len(clouds)):
         found = clock.time(calls(xyz))
-        same += same_clusters(found[PLAIN], found["ours"], found["ours"] > 0)
-    rows = [against(PLAIN, clock.medians(), 3, same)]
-    return measured(title, len(clouds), np.median([len(c) for c in clouds]), rows)
+        same += have_same_clusters(found[PLAIN], found["ours"], found["ours"] > 0)
+    rows = [compute_speedup(PLAIN, clock.medians(), 3, same)]
+    return make_measurement(title, len(clouds), np.median([len(c) for c in clouds]), rows)
 
 
 def measure_paper_c(scans: list[np.ndarray], repeat: int) -> dict:
-    """Paper C's segmentation of whole scans, ground included: cloth, then Euclidean."""
+    """Measure paper C's segmentation of whole scans: cloth, then Euclidean clustering."""
     def segment(xyz, threshold):
         rest = xyz.compress(~segment_by_cloth(xyz), axis=0)
         return cluster_euclidean(rest, EuclideanParams(threshold=threshold))
@@ -113,14 +125,14 @@ def measure_paper_c(scans: list[np.ndarray], repeat: int) -> dict:
     for xyz in show_progress(scans, title, len(scans)):
         clock.time(calls(xyz))
     ms = clock.medians()
-    rows = [row(f"({t} threshold)", ours_ms=ms[t], value=ms[t], unit="ms", target=60)
+    rows = [make_row(f"({t} threshold)", ours_ms=ms[t], value=ms[t], unit="ms", target=60)
             for t in ("global", "local")]
-    return measured(title, len(scans), np.median([len(s) for s in scans]), rows,
-                    cloth_ms=ms["cloth"])
+    return make_measurement(title, len(scans), np.median([len(s) for s in scans]), rows,
+                            cloth_ms=ms["cloth"])
 
 
-def core_points(xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:
-    """(N,) bool: with min_samples points of its band within its band's eps."""
+def find_core_points(xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:
+    """Return the mask (N,) of points with min_samples points of their band within its eps."""
     def labels(band, eps, min_samples):
         tree = cKDTree(band.astype(np.float64))
         found = tree.query_ball_point(tree.data, eps, return_length=True)
@@ -128,8 +140,8 @@ def core_points(xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.nd
     return peers.by_bands(labels, xyz, params) > 0
 
 
-def same_clusters(a: np.ndarray, b: np.ndarray, core: np.ndarray) -> bool:
-    """Whether labels a and b (N,) have the same noise, 0, and part the core points alike."""
+def have_same_clusters(a: np.ndarray, b: np.ndarray, core: np.ndarray) -> bool:
+    """Return True if labels a and b (N,) have equal noise (0) and partition core points equally."""
     if not np.array_equal(a == 0, b == 0):
         return False
     pairs = np.unique(np.stack([a[core], b[core]]), axis=1)

@@ -1,5 +1,7 @@
-"""Every version and size of EG-PointPillars on this machine's device: the time of each step; and
-the sparse engine compared with torch on the CPU."""
+"""Time of each step of every version and size of EG-PointPillars on this machine's device.
+
+The sparse engine is also compared with torch on the CPU.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,8 @@ import torch
 from rich.table import Table
 from scipy.special import expit
 
-from benchmark.rows import against, measured
-from benchmark.timing import Clock, evenly_chosen
+from benchmark.rows import compute_speedup, make_measurement
+from benchmark.timing import Clock, choose_evenly
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import FUSED, DetectionResult
 from lidar_perception.detectors.devices import CPU, find_device
@@ -39,24 +41,27 @@ FEW = 3           # scans for full on a CPU, where a frame takes half a second
 
 def measure_detection(scans: list[PointCloud], repeat: int,
                       sizes: Sequence[str] = tuple(SIZES)) -> dict:
-    """Medians over whole scans, each `repeat` times, versions taken in turn, all in torch. Weights
-    are random: time depends on them only by what passes the thresholds, which are set to let
-    CANDIDATES anchors through."""
+    """Measure the median time of each step over whole scans, versions in turn, all in torch.
+
+    Weights are random: time depends on them only through the number of anchors above the
+    thresholds, which let CANDIDATES anchors pass.
+    """
     device = find_device()
     name = torch.cuda.get_device_name(device) if device != CPU else read_cpu_name()
     content: dict[str, Any] = {"device": name, "threads": thread_count(), "sizes": {}}
     for size in sizes:
-        chosen = evenly_chosen(scans, FEW) if (size, device) == ("full", CPU) else scans
-        detectors = {version: _random_detector(version, size, device, chosen[0])
+        chosen = choose_evenly(scans, FEW) if (size, device) == ("full", CPU) else scans
+        detectors = {version: _make_detector(version, size, device, chosen[0])
                      for version in VERSIONS}
         content["sizes"][size] = {
             "frames": len(chosen), "points": float(np.median([len(s) for s in chosen])),
-            "versions": _medians(detectors, chosen, repeat, f"PointPillars {size}")}
+            "versions": _compute_medians(detectors, chosen, repeat, f"PointPillars {size}")}
     return content
 
 
-def _medians(detectors: dict[str, PointPillarsDetector], scans: list[PointCloud], repeat: int,
-             title: str) -> dict[str, dict]:
+def _compute_medians(
+    detectors: dict[str, PointPillarsDetector], scans: list[PointCloud], repeat: int, title: str
+) -> dict[str, dict]:
     ms = {version: np.zeros((len(scans), repeat, len(STEPS))) for version in detectors}
     for i, scan in enumerate(show_progress(scans, title, len(scans))):
         for j in range(repeat):
@@ -74,7 +79,7 @@ def _medians(detectors: dict[str, PointPillarsDetector], scans: list[PointCloud]
     return found
 
 
-class Heard:
+class RecordingNetwork:
     """A network that keeps its last logits (A, K)."""
 
     has_fixed_range = True
@@ -84,7 +89,7 @@ class Heard:
         self.logits: np.ndarray | None = None
 
     def to(self, device: str) -> None:
-        """As Network."""
+        """See Network.to."""
         self.network.to(device)
 
     def __call__(self, pillars, maps):
@@ -93,12 +98,12 @@ class Heard:
         return prediction
 
 
-def _random_detector(version: str, size: str, device: str,
-                     scan: PointCloud) -> PointPillarsDetector:
-    """Warmed up, with thresholds that CANDIDATES anchors pass in this scan."""
+def _make_detector(version: str, size: str, device: str,
+                   scan: PointCloud) -> PointPillarsDetector:
+    """Return a warmed-up detector whose thresholds CANDIDATES anchors of this scan pass."""
     config = make_config(version, size)
     torch.manual_seed(0)
-    heard = Heard(TorchNetwork(make_network(config).eval(), device))
+    heard = RecordingNetwork(TorchNetwork(make_network(config).eval(), device))
     detector = PointPillarsDetector(PointPillarsProposer(heard, Header(config), device))
     detector.warm_up()
     detector(scan)
@@ -112,7 +117,7 @@ def _random_detector(version: str, size: str, device: str,
 
 
 def print_detection(content: dict) -> None:
-    """A table for each size, with each step's share."""
+    """Print a table for each size, with the share of each step."""
     for size, figures in content["sizes"].items():
         table = Table(title=f"EG-PointPillars {size}, ms a frame ({figures['frames']} scans, "
                             f"{figures['points']:.0f} points) on {content['device']}, "
@@ -131,8 +136,10 @@ def print_detection(content: dict) -> None:
 
 def measure_engines(scans: list[PointCloud], repeat: int,
                     detectors: Sequence[str] = (POINTPILLARS, FUSED)) -> dict:
-    """Compare the engines torch and sparse of PointPillars with the weights of the package: median
-    CPU time of one thread, in turns. `same` counts scans with the same detections."""
+    """Compare the engines torch and sparse of PointPillars with the shipped weights.
+
+    Median CPU time of one thread, in turn. `same` counts scans with equal detections.
+    """
     threads = thread_count()
     set_thread_count(1)
     rows = []
@@ -146,15 +153,15 @@ def measure_engines(scans: list[PointCloud], repeat: int,
             for scan in show_progress(scans, name, len(scans)):
                 found = clock.time({each: partial(detector, scan)
                                     for each, detector in engines.items()})
-                same += _same(found["torch"], found["ours"])
+                same += _have_same_detections(found["torch"], found["ours"])
             ms = clock.medians()
-            rows.append(against(name, {name: ms["torch"], "ours": ms["ours"]}, same=same))
+            rows.append(compute_speedup(name, {name: ms["torch"], "ours": ms["ours"]}, same=same))
     set_thread_count(threads)
     title = f"Sparse engine, CPU ms of one thread at a load of {os.getloadavg()[0]:.1f}"
-    return measured(title, len(scans), np.median([len(scan) for scan in scans]), rows)
+    return make_measurement(title, len(scans), np.median([len(scan) for scan in scans]), rows)
 
 
-def _same(a: DetectionResult, b: DetectionResult) -> bool:
+def _have_same_detections(a: DetectionResult, b: DetectionResult) -> bool:
     a_, b_ = a.detections, b.detections
     return bool(np.array_equal(a_.class_ids, b_.class_ids)
                 and np.allclose(a_.boxes, b_.boxes, rtol=0, atol=1e-4)

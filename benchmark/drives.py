@@ -1,9 +1,9 @@
-"""Trackers on simulated drives that nothing was chosen on, with intervals by drive.
+"""Trackers on simulated drives that were not used to choose parameters, with intervals by drive.
 
     python -m benchmark.drives --drives 20 --seconds 20 --cache folder --json tracks.json
 
-Detections are computed once and kept in --cache, as simulation and networks take a second a frame;
-the trackers behind them take milliseconds.
+Detections are computed once and kept in --cache: simulation and networks take a second per frame,
+the trackers milliseconds.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 from rich.table import Table
 
 from benchmark.plain_ab3dmot import PlainAb3dmot
-from benchmark.precision import Curve, curve_of, precisions
-from benchmark.tracking import Seen, Step, peer, tracker
+from benchmark.precision import Curve, compute_precisions, make_curves
+from benchmark.tracking import Step, TrackedFrame, peer, tracker
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.seed_sources import make_automatic_source
 from lidar_perception.candidates.seeds import load_seeds
@@ -48,12 +48,12 @@ DETECTORS = {**dict.fromkeys(NETWORKS, (tuple(DETECTED), ScoreParams().car)),
              "candidates": (("Pedestrian",), BEST.confidence.threshold)}
 RESAMPLED, LEAST, INTERVAL = 2000, 0.001, (2.5, 97.5)
 RECALLS = (0.3, 0.5, 0.6)
-Drive = list[tuple[Seen, dict[str, Detections]]]
+Drive = list[tuple[TrackedFrame, dict[str, Detections]]]
 Counts = dict[str, tuple[HotaCounts, ClearCounts]]
 
 
-def detected(street: int, frames: int, people: float) -> Drive:
-    """The first scans of a street and what each detector finds in them, weak detections too."""
+def detect(street: int, frames: int, people: float) -> Drive:
+    """Detect in the first scans of a street with each detector, weak detections included."""
     params = with_values(BEST, {"seed.source": "automatic"})
     detectors: dict[str, Detector] = {
         "candidates": CandidateDetector(make_automatic_source(load_seeds(), params),
@@ -63,32 +63,38 @@ def detected(street: int, frames: int, people: float) -> Drive:
     drive = []
     for i in range(frames):
         scan = simulate_scan(street, i, HDL64E, Scenes(None, people))
-        found = {name: _found(each, scan.frame) for name, each in detectors.items()}
-        drive.append((Seen(Detections.none(), make_kitti_labels(scan.truth), scan.frame.stamp_ns,
-                           scan.pose), found))
+        found = {name: _detect_street(each, scan.frame) for name, each in detectors.items()}
+        drive.append(
+            (
+                TrackedFrame(
+                    Detections.none(), make_kitti_labels(scan.truth), scan.frame.stamp_ns, scan.pose
+                ),
+                found,
+            )
+        )
     return drive
 
 
-def _found(detector: Detector, frame) -> Detections:
+def _detect_street(detector: Detector, frame) -> Detections:
     try:
         return detector(frame).detections
     except InputError:  # no seed in this frame
         return Detections.none()
 
 
-def cached(folder: Path, street: int, frames: int, people: float) -> Drive:
-    """detected(), kept in a folder of one's own."""
+def load_detections(folder: Path, street: int, frames: int, people: float) -> Drive:
+    """Return detected() from a folder, or compute and keep it there."""
     file = folder / f"{street}_{frames}_{people:g}.pkl"
     if not file.exists():
         folder.mkdir(parents=True, exist_ok=True)
         part = file.with_suffix(".part")
-        part.write_bytes(pickle.dumps(detected(street, frames, people)))
+        part.write_bytes(pickle.dumps(detect(street, frames, people)))
         part.rename(file)
     return pickle.loads(file.read_bytes())
 
 
-def counts_of(drive: list[Seen], step: Step, classes: tuple[str, ...]) -> Counts:
-    """By class, what a tracker makes of a drive."""
+def count_tracks(drive: list[TrackedFrame], step: Step, classes: tuple[str, ...]) -> Counts:
+    """Count the tracks of a drive by class."""
     frames = []
     for seen in drive:
         ids, found = step(seen)
@@ -97,16 +103,19 @@ def counts_of(drive: list[Seen], step: Step, classes: tuple[str, ...]) -> Counts
                    count_clear(own)) for name in classes}
 
 
-def measured(drives: list[Drive], detector: str, params: TrackingParams) -> dict:
-    """By class: the scores of both trackers with intervals, and precision at equal recall of
-    single frames and of tracks."""
+def measure_drives(drives: list[Drive], detector: str, params: TrackingParams) -> dict:
+    """Measure both trackers by class.
+
+    Returns their scores with intervals, and the precision of single frames and of tracks at equal
+    recall.
+    """
     classes, operating = DETECTORS[detector]
     chosen = [[replace(seen, found=found[detector]) for seen, found in drive] for drive in drives]
-    peers = [counts_of(drive, peer(PlainAb3dmot(), operating), classes) for drive in chosen]
-    ours = [counts_of(drive, tracker(params), classes) for drive in chosen]
+    peers = [count_tracks(drive, peer(PlainAb3dmot(), operating), classes) for drive in chosen]
+    ours = [count_tracks(drive, tracker(params), classes) for drive in chosen]
     all_of_them = with_values(params, {"report": 0.0})
-    single = [curve_of(drive, _single(), classes) for drive in chosen]
-    tracked = [curve_of(drive, tracker(all_of_them), classes) for drive in chosen]
+    single = [make_curves(drive, _single(), classes) for drive in chosen]
+    tracked = [make_curves(drive, tracker(all_of_them), classes) for drive in chosen]
     return {name: {**_scores([p[name] for p in peers], [o[name] for o in ours]),
                    "precision": _precision([s[name] for s in single], [t[name] for t in tracked])}
             for name in classes}
@@ -121,8 +130,8 @@ def _scores(peers: list[tuple], ours: list[tuple]) -> dict:
     both = {}
     for name, counted in ("peer", peers), ("ours", ours):
         clear = sum((c for _, c in counted), ClearCounts())
-        hota = resampled(counted, lambda chosen: sum((h for h, _ in chosen), HotaCounts()
-                                                     ).scores()["HOTA"])
+        hota = resample(counted, lambda chosen: sum((h for h, _ in chosen), HotaCounts()
+                                                    ).scores()["HOTA"])
         both[name] = {**sum((h for h, _ in counted), HotaCounts()).scores(), **clear.scores(),
                       "interval": _interval(hota), "switches": clear.switches,
                       "fragments": clear.fragments, "hits": clear.tp, "false": clear.fp}
@@ -135,22 +144,26 @@ def _scores(peers: list[tuple], ours: list[tuple]) -> dict:
 
 def _precision(single: list[Curve], tracked: list[Curve]) -> dict:
     each_once = np.ones((1, len(single)), int)
-    times = np.array([np.bincount(draw, minlength=len(single)) for draw in draws(len(single))])
-    values = [precisions(curves, RECALLS, np.concatenate([each_once, times]))
+    times = np.array(
+        [np.bincount(draw, minlength=len(single)) for draw in draw_drives(len(single))]
+    )
+    values = [compute_precisions(curves, RECALLS, np.concatenate([each_once, times]))
               for curves in (single, tracked)]
     return {str(recall): {"single": float(one[0]), "tracked": float(many[0]),
                           "gain_interval": _interval(many[1:] - one[1:])}
             for recall, one, many in zip(RECALLS, *(v.T for v in values))}
 
 
-def resampled(drives: list, value: Callable[[list], float]) -> np.ndarray:
-    """(RESAMPLED,) values of drives drawn with replacement, the same draws for the same number of
-    drives, so that differences are paired."""
-    return np.array([value([drives[i] for i in draw]) for draw in draws(len(drives))])
+def resample(drives: list, value: Callable[[list], float]) -> np.ndarray:
+    """Return values (RESAMPLED,) over drives drawn with replacement.
+
+    The draws are the same for the same number of drives, so differences are paired.
+    """
+    return np.array([value([drives[i] for i in draw]) for draw in draw_drives(len(drives))])
 
 
-def draws(count: int) -> np.ndarray:
-    """(RESAMPLED, count) indices of so many drives, always the same."""
+def draw_drives(count: int) -> np.ndarray:
+    """Draw indices (RESAMPLED, count) of drives, with a fixed seed."""
     return np.random.default_rng(0).integers(0, count, (RESAMPLED, count))
 
 
@@ -159,7 +172,7 @@ def _interval(values: np.ndarray) -> list[float]:
 
 
 def print_drives(content: dict) -> None:
-    """One row a detector and class; peer, then ours, in percent."""
+    """Print a row per detector and class: the peer, then ours, in percent."""
     table = Table(title=f"{content['drives']} drives of {content['seconds']:g} s")
     for name in ("detector", "class", "boxes", "HOTA", "gain", "switches", "precision", "recall",
                  *(f"precision at recall {r}" for r in RECALLS)):
@@ -192,12 +205,12 @@ def _range(interval: list[float]) -> str:
 @click.option("--json", "json_file", type=click.Path(path_type=Path))
 def main(first: int, count: int, seconds: float, people: float, cache: Path,
          json_file: Path | None) -> None:
-    """Our tracker beside a plain AB3DMOT, and single frames beside tracks, on simulated drives."""
+    """Compare our tracker with a plain AB3DMOT and with single frames on simulated drives."""
     frames = round(seconds * HDL64E.rate)
-    drives = [cached(cache, street, frames, people) for street in
+    drives = [load_detections(cache, street, frames, people) for street in
               show_progress(range(first, first + count), "detecting", count)]
     content = {"drives": count, "seconds": seconds, "people": people, "first": first, "detectors": {
-        name: measured(drives, name, TrackingParams()) for name in DETECTORS}}
+        name: measure_drives(drives, name, TrackingParams()) for name in DETECTORS}}
     print_drives(content)
     if json_file:
         write_text(json_file, json.dumps(content, indent=1))

@@ -16,7 +16,7 @@ from lidar_perception.wire.topics import POINTS
 
 
 def measure_graph(recording: Recording, single: bool) -> dict:
-    """Latency, losses and memory of the nodes at 10 Hz, which the recorder hears, too."""
+    """Measure latency, losses and memory of the nodes at 10 Hz, with the recorder subscribed."""
     from lidar_perception.nodes.replay.graph_replay import replay
     with tempfile.TemporaryDirectory() as folder:
         drive, out = Path(folder) / "drive", Path(folder)

@@ -1,4 +1,4 @@
-"""Ground beside its peers."""
+"""Ground segmentation against its peers."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from benchmark import peers
-from benchmark.rows import against, measured, row
-from benchmark.timing import SLOW_REPEAT, Clock, evenly_chosen, thin
+from benchmark.rows import compute_speedup, make_measurement, make_row
+from benchmark.timing import SLOW_REPEAT, Clock, choose_evenly, thin
 from lidar_perception.data.frame import Frame
 from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.params import ClothParams, GroundParams, ThresholdParams
@@ -30,25 +30,35 @@ FRAMES_OF_2000 = 3  # scikit-learn's 2000 trials take seconds
 
 
 def measure_threshold(title: str, clouds: list[np.ndarray], repeat: int) -> dict:
-    """Ours beside scikit-learn's RANSAC on points (N, 3) lower than paper A's z < -1.3: with its
-    own early stop and without; and how far the planes of the same low points differ."""
+    """Measure our plane fit and scikit-learn's RANSAC on points (N, 3) below paper A's z < -1.3.
+
+    RANSAC runs with and without its early stop. Also measures how much the planes differ.
+    """
     rows: list[dict] = []
     planes: dict[str, dict] = {}
     for group, chosen, times in (
             (peers.RANSACS, clouds, repeat),
-            ((peers.RANSAC_2000,), evenly_chosen(clouds, FRAMES_OF_2000), 1)):
+            ((peers.RANSAC_2000,), choose_evenly(clouds, FRAMES_OF_2000), 1)):
         here = [p for p in group if not p.missing()]
-        ms, found = _timed(title, chosen, times, here)
+        ms, found = _measure_times(title, chosen, times, here)
         for p in group:
-            rows.append(against(p.name, ms, 20) if p in here else row(p.name, note=p.missing()))
-        planes |= {p.name: _plane_differences(chosen, found[p.name]) for p in here}
-    return measured(title, len(clouds), np.median([len(c) for c in clouds]), rows, planes=planes,
-                    frames_of_2000_trials=min(FRAMES_OF_2000, len(clouds)))
+            rows.append(
+                compute_speedup(p.name, ms, 20) if p in here else make_row(p.name, note=p.missing())
+            )
+        planes |= {p.name: _compare_planes(chosen, found[p.name]) for p in here}
+    return make_measurement(
+        title,
+        len(clouds),
+        np.median([len(c) for c in clouds]),
+        rows,
+        planes=planes,
+        frames_of_2000_trials=min(FRAMES_OF_2000, len(clouds)),
+    )
 
 
-def _timed(title: str, clouds: list[np.ndarray], repeat: int,
-           here: list[peers.Peer]) -> tuple[dict, dict]:
-    """Medians, and what each peer gave on each cloud."""
+def _measure_times(title: str, clouds: list[np.ndarray], repeat: int,
+                   here: list[peers.Peer]) -> tuple[dict, dict]:
+    """Return median times, and the result of each peer on each cloud."""
     def calls(xyz):
         # The low points are chosen within the time, as ours does.
         return {**{p.name: lambda p=p: p.run(xyz, _low(xyz)) for p in here},
@@ -63,14 +73,16 @@ def _low(xyz: np.ndarray) -> np.ndarray:
     return xyz[:, 2] < PARAMS.threshold.max_height - SENSOR_HEIGHT
 
 
-def _plane_differences(clouds: list[np.ndarray], found: list[tuple]) -> dict:
-    """Ours from the low points against theirs, as it is and fitted to its inliers until stable:
-    cm at the sensor and degrees, median and max over the frames; and in how many of these either
-    plane has more inliers."""
+def _compare_planes(clouds: list[np.ndarray], found: list[tuple]) -> dict:
+    """Compare our planes with theirs, as fitted and refitted to the inliers until stable.
+
+    Returns differences in cm at the sensor and degrees, median and max over frames, and the number
+    of frames in which either plane has more inliers.
+    """
     low = [xyz[_low(xyz)] for xyz in clouds]
     ours = [fit_plane_by_ransac(points, PARAMS.threshold) for points in low]
     theirs = [plane for _, plane, _ in found]
-    settled = [_settled(points.astype(np.float64), plane) for points, plane in zip(low, theirs)]
+    settled = [_refit(points.astype(np.float64), plane) for points, plane in zip(low, theirs)]
     trials = float(np.median([trials for _, _, trials in found]))
     result: dict[str, Any] = {"trials": trials, "difference": {}}
     for name, planes in (("raw", theirs), ("refined", settled)):
@@ -95,9 +107,9 @@ def _inliers(points: np.ndarray, plane: np.ndarray) -> int:
     return int((np.abs(height) <= PARAMS.threshold.inlier_distance).sum())
 
 
-def _settled(points: np.ndarray, plane: np.ndarray,
-             params: ThresholdParams = PARAMS.threshold) -> np.ndarray:
-    """Least squares on the inliers until these no longer change."""
+def _refit(points: np.ndarray, plane: np.ndarray,
+           params: ThresholdParams = PARAMS.threshold) -> np.ndarray:
+    """Refit by least squares until the inliers no longer change."""
     before = None
     for _ in range(100):
         near = np.abs(height_above_plane(points, plane)) <= params.inlier_distance
@@ -109,11 +121,13 @@ def _settled(points: np.ndarray, plane: np.ndarray,
 
 
 def measure_patchwork(frames: list[PointCloud], repeat: int) -> dict:
-    """Ours beside the bare library on an array that already exists; a new object for each."""
+    """Measure ours and the bare library on an existing array, with a new object per cloud."""
     title, name = "Patchwork++, whole scan", peers.PATCHWORK.name
     points = np.median([len(f) for f in frames])
     if peers.PATCHWORK.missing():
-        return measured(title, len(frames), points, [row(name, note=peers.PATCHWORK.missing())])
+        return make_measurement(
+            title, len(frames), points, [make_row(name, note=peers.PATCHWORK.missing())]
+        )
 
     def calls(frame, cloud):
         return {name: partial(peers.PATCHWORK.run, cloud, SENSOR_HEIGHT),
@@ -126,8 +140,8 @@ def measure_patchwork(frames: list[PointCloud], repeat: int) -> dict:
             found = clock.time(calls(frame, _with_intensity(frame)))
             apart = int((_mask(found[name], len(frame)) != found["ours"]).sum())
             same, differ = same + (apart == 0), differ + apart
-    return measured(title, len(frames), points, [
-        against(name, clock.medians(), 1.3, same, differ)])
+    return make_measurement(title, len(frames), points, [
+        compute_speedup(name, clock.medians(), 1.3, same, differ)])
 
 
 def _with_intensity(frame: PointCloud) -> np.ndarray:
@@ -141,13 +155,17 @@ def _mask(indices, count: int) -> np.ndarray:
 
 
 def measure_cloth(scans: list[np.ndarray], repeat: int) -> dict:
-    """Ours beside the wheel's falling cloth of the same resolution, on points within max_range.
-    Not in the wheel's time: its float64 array, and the mask from its indices."""
+    """Measure our cloth and the wheel's, of equal resolution, on points within max_range.
+
+    The wheel's time excludes its float64 array and the mask from its indices.
+    """
     title, name = "Cloth, whole scan", peers.CLOTH.name
     scans = [_within(xyz) for xyz in scans]
     points = np.median([len(s) for s in scans])
     if peers.CLOTH.missing():
-        return measured(title, len(scans), points, [row(name, note=peers.CLOTH.missing())])
+        return make_measurement(
+            title, len(scans), points, [make_row(name, note=peers.CLOTH.missing())]
+        )
 
     def calls(xyz, precise):
         return {name: partial(peers.CLOTH.run, precise), "ours": partial(segment_by_cloth, xyz)}
@@ -156,7 +174,7 @@ def measure_cloth(scans: list[np.ndarray], repeat: int) -> dict:
         clock = Clock(min(repeat, SLOW_REPEAT), calls(*_both(thin(scans[0]))))
         for xyz in show_progress(scans, title, len(scans)):
             clock.time(calls(*_both(xyz)))
-    return measured(title, len(scans), points, [against(name, clock.medians(), 6)])
+    return make_measurement(title, len(scans), points, [compute_speedup(name, clock.medians(), 6)])
 
 
 def _both(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -168,7 +186,7 @@ def _within(xyz: np.ndarray, params: ClothParams = PARAMS.cloth) -> np.ndarray:
 
 
 def measure_labelled(frames: list[Frame], repeat: int) -> dict:
-    """Precision, recall and F1 of our three methods and the cloth of the wheel by protocol."""
+    """Measure precision, recall and F1 of our three methods and the wheel's cloth by protocol."""
     missing = {"patchwork": peers.PATCHWORK.missing(), peers.CLOTH.name: peers.CLOTH.missing()}
     methods: dict[str, Callable] = {
         **{name: partial(_of_ours, name) for name in METHODS}, peers.CLOTH.name: _of_wheel}

@@ -1,7 +1,7 @@
-"""Peak memory of our DBSCAN over what the process holds before, in a fresh process.
+"""Peak memory of our DBSCAN above the baseline of a fresh process.
 
-The child loads the points, warms up, sets its high-water mark back (/proc/self/clear_refs), notes
-its resident memory, runs, and reads the mark (VmHWM). getrusage would not do: its ru_maxrss is
+The child loads the points, warms up, resets its high-water mark (/proc/self/clear_refs), notes its
+resident memory, runs, and reads the mark (VmHWM). getrusage is not suitable: its ru_maxrss is
 inherited from the parent across exec.
 """
 
@@ -19,7 +19,7 @@ METHOD = ("peak resident memory (VmHWM, set back before the run) less the reside
 
 
 def dbscan_memory(xyz: np.ndarray) -> float | None:
-    """MB over baseline of distance_aware_dbscan on points (N, 3); None without Linux' /proc."""
+    """Return MB above baseline of DBSCAN on points (N, 3), or None without Linux' /proc."""
     if not Path("/proc/self/clear_refs").exists():
         return None
     with tempfile.TemporaryDirectory() as folder:

@@ -1,8 +1,10 @@
-"""What motion correction gains: simulated turns of a sensor that drives and turns, as it reports
-them, and moved to their stamp by odometry: python -m benchmark.motion [STREETS]
+"""Gain of motion correction on simulated scans of a moving sensor.
 
-Error of a thing: how far the mean of its points is from where it was met, the same points in the
-sensor's frame at the stamp. The odometry is exact and comes 50 times a second.
+    python -m benchmark.motion [STREETS]
+
+Clouds are compared as the sensor reports them and as corrected by odometry. The error of an object
+is the distance from the mean of its points to the mean of the same points in the sensor's frame at
+the stamp. The odometry is exact and has 50 Hz.
 """
 
 from __future__ import annotations
@@ -34,8 +36,8 @@ NEAR = 2.0                 # m between a detection and its label
 ODOMETRY_HZ = 50
 
 
-def odometry(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """times (K,) ns around the stamp, translations (K, 3) and quaternions (K, 4) of the sensor."""
+def make_odometry(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times (K,) ns around the stamp, translations (K, 3) and quaternions (K, 4)."""
     step = 10**9 // ODOMETRY_HZ
     times = np.arange(-6, 7) * step + step // 3
     half = times * 1e-9 * motion.yaw_rate / 2
@@ -43,15 +45,17 @@ def odometry(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             np.column_stack([np.zeros((len(times), 2)), np.sin(half), np.cos(half)]))
 
 
-def where(way: tuple[np.ndarray, np.ndarray, np.ndarray], at: np.ndarray) -> np.ndarray:
-    """(N, 4, 4): the poses of an odometry at (N,) seconds."""
+def read_poses(way: tuple[np.ndarray, np.ndarray, np.ndarray], at: np.ndarray) -> np.ndarray:
+    """Return the poses (N, 4, 4) of an odometry at times (N,), seconds."""
     return interpolate_poses(*way, np.rint(at * 1e9).astype(np.int64))
 
 
-def turns(seed: int) -> Iterator[tuple]:
-    """Of a street: speed, yaw rate, the clouds as met, as reported and as corrected, each with the
-    same points, the number of each point's thing (0: none), which things are boxes that stand, and
-    the labels."""
+def simulate_turns(seed: int) -> Iterator[tuple]:
+    """Simulate turns of the sensor in a street.
+
+    Returns speed, yaw rate, the true, reported and corrected clouds with the same points, the
+    object of each point (0: none), which objects are static boxes, and the labels.
+    """
     scene = make_scene(seed)
     moment = scene.at(5.0, HDL64E.height)
     for motion in (moment.motion._replace(yaw_rate=rate) for rate in YAW_RATES):
@@ -59,7 +63,9 @@ def turns(seed: int) -> Iterator[tuple]:
         met, reported = (
             make_returns(hits, HDL64E, motion, np.random.default_rng(seed), compensated)
             for compensated in (True, False))
-        corrected = deskew(reported.xyz, met.time.astype(float), partial(where, odometry(motion)))
+        corrected = deskew(
+            reported.xyz, met.time.astype(float), partial(read_poses, make_odometry(motion))
+        )
         since = make_rays(HDL64E, motion).since.astype(np.float32)
         order = np.argsort(since)
         solid = hits.solid[order[np.searchsorted(since[order], met.time)], met.ring]
@@ -71,17 +77,22 @@ def turns(seed: int) -> Iterator[tuple]:
                thing, standing, label_scan(moment, hits, met.owner))
 
 
-def errors(xyz: np.ndarray, met: np.ndarray, thing: np.ndarray) -> dict[int, float]:
-    """Thing -> metres between the means of its points."""
+def compute_errors(xyz: np.ndarray, met: np.ndarray, thing: np.ndarray) -> dict[int, float]:
+    """Return the distance in metres between the means of the points of each object."""
     count = np.bincount(thing)
     shift = np.column_stack([np.bincount(thing, axis) for axis in (xyz - met).astype(float).T])
     return {i: float(np.linalg.norm(shift[i] / count[i]))
             for i in np.flatnonzero(count >= FEW).tolist() if i}
 
 
-def detected(detector: Detector, xyz: np.ndarray, intensity: np.ndarray, labels) -> list[float]:
-    """Metres, from above, between each label that is found and the nearest detection of its
-    class."""
+def measure_detections(
+    detector: Detector, xyz: np.ndarray, intensity: np.ndarray, labels
+) -> list[float]:
+    """Measure the detection errors of a cloud.
+
+    Returns the BEV distance in metres between each detected label and the nearest detection of its
+    class.
+    """
     found, far = detector(PointCloud(xyz, intensity)).detections, []
     for box, kind in zip(labels.boxes, labels.class_ids):
         same = found.boxes[found.class_ids == kind]
@@ -97,16 +108,20 @@ def measure(streets: int) -> None:
     rows: dict[tuple, list[float]] = defaultdict(list)
     speeds = []
     for seed in range(streets):
-        for speed, rate, (met, reported, corrected), thing, standing, labels in turns(seed):
+        for speed, rate, (met, reported, corrected), thing, standing, labels in simulate_turns(
+            seed
+        ):
             speeds.append(speed)
             for name, xyz in (("reported", reported.xyz), ("corrected", corrected)):
-                for i, error in errors(xyz, met.xyz, thing).items():
+                for i, error in compute_errors(xyz, met.xyz, thing).items():
                     kind = "poles" if i >= len(standing) else "standing boxes"
                     if i >= len(standing) or standing[i]:
                         rows[rate, kind, name].append(error)
             for name, xyz in (("met", met.xyz), ("reported", reported.xyz),
                               ("corrected", corrected)):
-                rows[rate, "detections", name] += detected(detector, xyz, met.intensity, labels)
+                rows[rate, "detections", name] += measure_detections(
+                    detector, xyz, met.intensity, labels
+                )
     table = Table(title=f"{streets} streets, {np.mean(speeds):.1f} m/s in the mean")
     for column in ("yaw rate, rad/s", "of", "number", "median, m", "95 %, m"):
         table.add_column(column)

@@ -1,10 +1,10 @@
-"""What KISS-ICP costs beside a detector, and how far off its poses are.
+"""Cost of KISS-ICP compared with a detector, and the error of its poses.
 
     python -m benchmark.odometry --data /data/kitti/tracking
     python -m benchmark.odometry --streets 6
 
-Every scan is taken in turn by KISS-ICP as it comes, by Odometry, and by the detectors; CPU time, as
-that of a busy machine hardly differs. Simulated streets have exact poses.
+Each scan is processed in turn by KISS-ICP with default settings, by Odometry, and by the detectors.
+CPU time is measured, which hardly changes on a busy machine. Simulated streets have exact poses.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ FIRST_STREET, FURTHER = 7301, 10  # frames over which drift is said
 Scans = Iterator[tuple[str, PointCloud, np.ndarray | None]]
 
 
-def as_it_comes() -> Callable[[np.ndarray], np.ndarray]:
-    """KISS-ICP with its own settings, and the voxels of Odometry."""
+def make_default_odometry() -> Callable[[np.ndarray], np.ndarray]:
+    """Return KISS-ICP with its default settings and the voxel size of Odometry."""
     config = KISSConfig()
     config.mapping.voxel_size, config.data.deskew = 1.0, False
     icp = KissICP(config)
@@ -47,24 +47,27 @@ def as_it_comes() -> Callable[[np.ndarray], np.ndarray]:
 
 
 def read_scans(data: Path, frames: int) -> Scans:
-    """The first frames of a recording."""
+    """Return the first scans of a recording."""
     for frame in islice(open_recording(data), frames):
         yield frame.sequence, frame.load(), None
 
 
 def simulate_scans(streets: int, frames: int) -> Scans:
-    """The first frames of so many streets."""
+    """Return the first scans of several streets."""
     for street in range(FIRST_STREET, FIRST_STREET + streets):
         for scan in simulate_drive(street, frames):
             yield str(street), scan.frame, scan.pose
 
 
-def measured(given: Scans, detectors: tuple[str, ...]) -> dict[str, dict[str, float]]:
-    """By name: ms, the median CPU time of a scan; and, where the poses are known, step and drift,
-    root mean squares in metres over the next and the FURTHER-th frame."""
+def measure_odometry(given: Scans, detectors: tuple[str, ...]) -> dict[str, dict[str, float]]:
+    """Measure odometry and detectors by name.
+
+    ms is the median CPU time per scan. Where poses are known, step and drift are root mean square
+    errors in metres over the next frame and over FURTHER frames.
+    """
     torch.set_num_threads(1)
     found = {name: open_detector(name, "cpu") for name in detectors}
-    sources = {"KISS-ICP as it comes": as_it_comes, "Odometry": Odometry}
+    sources = {"KISS-ICP as it comes": make_default_odometry, "Odometry": Odometry}
     ms: dict[str, list[float]] = {name: [] for name in (*sources, *found)}
     ways: dict[str, list[tuple[np.ndarray, ...]]] = {}
     for drive, frame, pose in given:
@@ -85,13 +88,13 @@ def measured(given: Scans, detectors: tuple[str, ...]) -> dict[str, dict[str, fl
     for i, name in enumerate(sources, 1):
         for what, step in ("step", 1), ("drift", FURTHER):
             if known:
-                off = np.concatenate([_off(way[:, i], way[:, 0], step) for way in known])
+                off = np.concatenate([_compute_error(way[:, i], way[:, 0], step) for way in known])
                 result[name][what] = float(np.sqrt(np.mean(off ** 2)))
     return result
 
 
-def _off(poses: np.ndarray, true: np.ndarray, step: int) -> np.ndarray:
-    """(frames - step,) metres seen from above between two motions over `step` frames."""
+def _compute_error(poses: np.ndarray, true: np.ndarray, step: int) -> np.ndarray:
+    """Return the BEV distance (frames - step,) in metres between two motions over `step` frames."""
     there, meant = (invert_pose(p[:-step]) @ p[step:] for p in (poses, true))
     return np.linalg.norm((invert_pose(meant) @ there)[:, :2, 3], axis=1)
 
@@ -102,10 +105,10 @@ def _off(poses: np.ndarray, true: np.ndarray, step: int) -> np.ndarray:
               help="Simulated ones, where there is no --data.")
 @click.option("--frames", type=click.IntRange(2), default=30, show_default=True)
 def main(data: Path | None, streets: int, frames: int) -> None:
-    """What KISS-ICP costs beside a detector, and how far off its poses are."""
+    """Measure the cost of KISS-ICP compared with a detector, and the error of its poses."""
     given = read_scans(data, frames) if data else simulate_scans(streets, frames)
-    content = measured(show_progress(given, "driving", frames * (1 if data else streets)),
-                       DETECTORS if data else ())
+    content = measure_odometry(show_progress(given, "driving", frames * (1 if data else streets)),
+                               DETECTORS if data else ())
     table = Table(title="A scan: CPU ms; metres off over 1 frame, over 10")
     for name in ("", "CPU ms", "1", "10"):
         table.add_column(name, justify="right" if name else "left")

@@ -1,4 +1,4 @@
-"""The peers that come as packages, thinly wrapped; one that is not installed says so."""
+"""Thin wrappers of peers that are packages; a peer that is not installed reports it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lidar_perception.ground.params import ClothParams, PatchworkParams
 
 @dataclass(frozen=True)
 class Peer:
-    """run has the signature of its kind; package is what pip calls it."""
+    """An algorithm of a package; run has the signature of its kind, package is its name on PyPI."""
 
     name: str
     package: str
@@ -28,7 +28,7 @@ class Peer:
     run: Callable
 
     def missing(self) -> str:
-        """Why it cannot run here; empty if it can."""
+        """Reason why it cannot run here, empty if it can."""
         try:
             importlib.import_module(self.module)
         except ModuleNotFoundError:
@@ -70,7 +70,7 @@ DBSCANS = (*SKLEARN, WHEEL, OPEN3D)
 
 
 def by_bands(run: Callable, xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:
-    """(N,) labels of a DBSCAN band by band, as distance_aware_dbscan numbers them: 0 noise."""
+    """Cluster band by band with a DBSCAN; labels (N,) as of distance_aware_dbscan, 0 noise."""
     band = np.searchsorted(np.asarray(params.range_limits), horizontal_range(xyz), side="right")
     labels, last = np.zeros(len(xyz), np.int32), 0
     for i, eps in enumerate(params.eps):
@@ -88,7 +88,7 @@ TRIALS = 2000  # at most, as paper A has it
 
 
 def ransac(xyz: np.ndarray, low: np.ndarray, **settings) -> tuple[np.ndarray, np.ndarray, int]:
-    """The ground of scikit-learn's RANSACRegressor with paper A's numbers."""
+    """Segment ground by scikit-learn's RANSACRegressor with paper A's parameters."""
     from sklearn.linear_model import LinearRegression, RANSACRegressor
     found = RANSACRegressor(LinearRegression(), max_trials=TRIALS, residual_threshold=0.1,
                             random_state=0, **settings).fit(xyz[low, :2], xyz[low, 2])
@@ -98,8 +98,11 @@ def ransac(xyz: np.ndarray, low: np.ndarray, **settings) -> tuple[np.ndarray, np
 
 
 def ransac_without_stop(xyz: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """All 2000 trials. stop_probability=1.0 is not that: it is taken as 1 less the rounding error,
-    so that some 100 trials are enough; the stop has to be patched out."""
+    """Run all 2000 trials.
+
+    stop_probability=1.0 does not do that: it is clipped by the rounding error to about 100 trials,
+    so the stop is patched out.
+    """
     with mock.patch("sklearn.linear_model._ransac._dynamic_max_trials",
                     lambda *_: float("inf"), create=True):
         return ransac(xyz, low)
@@ -144,9 +147,11 @@ def _bare_patchwork(points: np.ndarray, sensor_height: float,
 
 
 def _falling_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()):
-    """Indices of the ground among points (N, 3) float64, as the wheel's own vector. No point may
-    be far out: the wheel aborts the process where it cannot hold the grid. Rigidness 3 and 500
-    iterations are its defaults."""
+    """Return indices of the ground among points (N, 3) float64, as the wheel's own vector.
+
+    No point may be far away: the wheel aborts the process if the grid does not fit into memory.
+    Rigidness 3 and 500 iterations are its defaults.
+    """
     import CSF
     cloth = CSF.CSF()
     cloth.params.bSloopSmooth = False

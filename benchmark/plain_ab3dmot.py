@@ -1,9 +1,8 @@
-"""A plain reading of AB3DMOT (Weng et al., IROS 2020): the peer of lidar_perception.tracking.
+"""A plain implementation of AB3DMOT (Weng et al., IROS 2020), the peer of our tracker.
 
-One Kalman filter with constant velocity a box, Hungarian assignment by the distance of centres,
-birth after 3 hits, death after 2 misses, classes apart; the numbers are its authors' own for KITTI
-(the covariances of their filter, gates of 6 m, 1 m for pedestrians). None of our code but the
-types.
+One constant-velocity Kalman filter per box, Hungarian assignment by centre distance, birth after 3
+hits, death after 2 misses, classes separate. Numbers are the authors' for KITTI (covariances, gates
+of 6 m, 1 m for pedestrians). It shares only the types with our code.
 """
 
 from __future__ import annotations
@@ -71,7 +70,7 @@ class PlainAb3dmot:
         for kind in sorted({*self.tracks, *detections.class_ids.tolist()}):
             for track in self._of_class(kind, detections[detections.class_ids == kind], pose):
                 ids.append(track.number)
-                boxes.append(_moved(track.state[[0, 1, 2, 4, 5, 6, 3]], np.linalg.inv(pose)))
+                boxes.append(_transform(track.state[[0, 1, 2, 4, 5, 6, 3]], np.linalg.inv(pose)))
                 classes.append(kind)
                 scores.append(track.score)
         return np.array(ids, int), Detections.of(np.reshape(boxes, (-1, 7)),
@@ -79,7 +78,7 @@ class PlainAb3dmot:
 
     def _of_class(self, kind: int, detections: Detections, pose: np.ndarray) -> list[_Track]:
         tracks = self.tracks.setdefault(kind, [])
-        moved = (_moved(box.astype(float), pose) for box in detections.boxes)
+        moved = (_transform(box.astype(float), pose) for box in detections.boxes)
         measured = [box[[0, 1, 2, 6, 3, 4, 5]] for box in moved]
         for track in tracks:
             track.predict()
@@ -99,8 +98,8 @@ class PlainAb3dmot:
         return [t for t in self.tracks[kind] if t.hits >= MIN_HITS or self.frames <= MIN_HITS]
 
 
-def _moved(box: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """A box (7,) in another frame; pose (4, 4)."""
+def _transform(box: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Transform a box (7,) by a pose (4, 4)."""
     forward = pose[:3, :3] @ [np.cos(box[6]), np.sin(box[6]), 0.0]
     return np.concatenate([pose[:3, :3] @ box[:3] + pose[:3, 3], box[3:6],
                            [np.arctan2(forward[1], forward[0])]])

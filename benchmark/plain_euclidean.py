@@ -1,7 +1,7 @@
-"""A plain reading of paper C's adaptive Euclidean clustering with SciPy and NumPy: the peer of
-lidar_perception.clustering.euclidean.
+"""A plain implementation of paper C's adaptive Euclidean clustering with SciPy and NumPy.
 
-Same definition (its docstring has it, with the equations), none of our code but the parameters.
+It is the peer of lidar_perception.clustering.euclidean, whose docstring has the definition and the
+equations. It shares only the parameters with our code.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ AT_ONCE = 4_000_000  # neighbours that are held at a time: about 300 MB
 
 
 def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams()) -> np.ndarray:
-    """(N,) int32 clusters of points (N, 3) float32, metres: 0 none, 1..K."""
+    """Cluster points (N, 3) float32, metres, as (N,) int32: 0 none, 1..K."""
     if len(xyz) == 0:
         return np.zeros(0, np.int32)
     tree = cKDTree(np.asarray(xyz, np.float32).astype(np.float64))
@@ -32,7 +32,7 @@ def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams()) -> n
 
 
 def _thresholds(tree: cKDTree, params: EuclideanParams) -> np.ndarray:
-    """(N,) Eq. 6 or Eq. 11, rounded to float32."""
+    """Compute the thresholds (N,) of Eq. 6 or Eq. 11, rounded to float32."""
     if params.threshold == "global":
         nearest = tree.query(tree.data, k=2)[0][:, 1]  # inf for a single point
         mean = np.full(tree.n, nearest.mean() if tree.n > 1 else 0.0)
@@ -47,8 +47,10 @@ def _thresholds(tree: cKDTree, params: EuclideanParams) -> np.ndarray:
 
 
 def _neighbours(tree: cKDTree, wanted: np.ndarray, radius: float) -> Iterator[tuple]:
-    """Rows of wanted points, rows of the points within radius of them (a few more at its rim),
-    squared distances; part by part, so that memory stays bounded."""
+    """Return rows of the wanted points, rows of points within radius of them, squared distances.
+
+    A few more points at the border are included. The search runs in parts to bound memory.
+    """
     rows = tree.indices[wanted[tree.indices]]  # in the order of the tree: parts are compact
     if len(rows) == 0:
         return
@@ -64,7 +66,7 @@ def _neighbours(tree: cKDTree, wanted: np.ndarray, radius: float) -> Iterator[tu
 
 
 def _components(tree: cKDTree, reach: np.ndarray, leads: np.ndarray) -> np.ndarray:
-    """(N,) component of each leader (Eq. 8); followers are alone in theirs."""
+    """Return the component (N,) of each leader (Eq. 8); followers are separate."""
     component = np.arange(tree.n)
     for i, j, squared in _neighbours(tree, leads, reach[leads].max(initial=0.0)):
         link = leads[j] & (squared <= reach[i] ** 2)
@@ -76,7 +78,7 @@ def _components(tree: cKDTree, reach: np.ndarray, leads: np.ndarray) -> np.ndarr
 
 def _with_followers(tree: cKDTree, reach: np.ndarray, leads: np.ndarray,
                     component: np.ndarray) -> np.ndarray:
-    """(N,) component of each point, -1 for a follower that no leader reaches."""
+    """Return the component (N,) of each point, -1 for followers without a leader."""
     result = np.where(leads, component, -1)
     for i, j, squared in _neighbours(tree, ~leads, reach[leads].max(initial=0.0)):
         reached = leads[j] & (squared <= reach[j] ** 2)
@@ -89,7 +91,7 @@ def _with_followers(tree: cKDTree, reach: np.ndarray, leads: np.ndarray,
 
 
 def _numbered(component: np.ndarray, min_size: int = 1) -> np.ndarray:
-    """(N,) int32: the components (below 0: none) of min_size points, 1..K by their first point."""
+    """Number the components of at least min_size points 1..K by their first point, (N,) int32."""
     kept = component >= 0
     kept[kept] = np.bincount(component[kept])[component[kept]] >= min_size
     _, first, inverse = np.unique(component[kept], return_index=True, return_inverse=True)
@@ -99,7 +101,7 @@ def _numbered(component: np.ndarray, min_size: int = 1) -> np.ndarray:
 
 
 def _merged(points: np.ndarray, labels: np.ndarray, gamma: float) -> np.ndarray:
-    """Eq. 9; the diameter of a cluster is the diagonal of its axis-aligned box."""
+    """Merge by Eq. 9; the diameter of a cluster is the diagonal of its axis-aligned box."""
     count = labels.max(initial=0)
     if count < 2:
         return labels

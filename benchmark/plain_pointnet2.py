@@ -1,6 +1,8 @@
-"""A plain reading of PointNet++ with single-scale grouping (Qi et al., NeurIPS 2017), as small
-repositories have it: farthest point sampling in a loop, ball query by sorting all distances, groups
-through 1 x 1 convolutions. It is a peer to time against, with the widths of our own network."""
+"""A plain implementation of PointNet++ with single-scale grouping (Qi et al., NeurIPS 2017).
+
+As in small repositories: farthest point sampling in a loop, ball query by sorting all distances,
+groups through 1 x 1 convolutions. It has the widths of our network and is only timed.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from lidar_perception.detectors.pointnet.config import PointNetConfig
 
 
 def farthest(xyz: Tensor, count: int) -> Tensor:
-    """(B, count) indices of points (B, N, 3), each farthest from those before it."""
+    """Return indices (B, count) of points (B, N, 3), each farthest from the previous ones."""
     batch, size = xyz.shape[:2]
     chosen = torch.zeros(batch, count, dtype=torch.long)
     apart, last = torch.full((batch, size), 1e10), torch.zeros(batch, dtype=torch.long)
@@ -26,7 +28,7 @@ def farthest(xyz: Tensor, count: int) -> Tensor:
 
 
 def ball(radius: float, count: int, xyz: Tensor, centres: Tensor) -> Tensor:
-    """(B, M, count) indices of the first points within the radius of centres (B, M, 3)."""
+    """Return indices (B, M, count) of the first points within the radius of centres (B, M, 3)."""
     size = xyz.shape[1]
     indices = torch.arange(size).expand(*centres.shape[:2], size).clone()
     indices[torch.cdist(centres, xyz) > radius] = size
@@ -35,7 +37,7 @@ def ball(radius: float, count: int, xyz: Tensor, centres: Tensor) -> Tensor:
 
 
 class SetAbstraction(nn.Module):
-    """Points in balls around some of them, each ball through layers and a maximum."""
+    """Groups of points in balls, each through layers and a maximum."""
 
     def __init__(self, count: int, radius: float, neighbours: int, *channels: int):
         super().__init__()
@@ -55,7 +57,7 @@ class SetAbstraction(nn.Module):
 
 
 class PlainPointNet2(nn.Module):
-    """Points (B, N, 5) to (B, classes + 1) logits and (B, 6 + 2 Y) box numbers."""
+    """Network from points (B, N, 5) to (B, classes + 1) logits and (B, 6 + 2 Y) box values."""
 
     def __init__(self, config: PointNetConfig):
         super().__init__()

@@ -1,6 +1,7 @@
-"""A plain reading of paper A with scikit-learn, OpenCV and NumPy: the peer of our pipeline.
+"""A plain implementation of paper A with scikit-learn, OpenCV and NumPy, the peer of our pipeline.
 
-Same decisions where the paper leaves a choice open, none of our code but the matrix of the camera.
+Where the paper leaves a choice open it makes our choice. It shares only the camera matrix with our
+code.
 """
 
 from __future__ import annotations
@@ -21,8 +22,11 @@ KERNEL = np.ones((3, 3), np.uint8)
 
 def candidates(xyz: np.ndarray, projection: np.ndarray, width: int, height: int,
                pedestrians: np.ndarray, ground: np.ndarray | None = None) -> dict:
-    """xyz (N, 3) -> points in view, ground, labels, boxes by stage (K, 7) and ms by step. ground,
-    where given, is taken instead of RANSAC's, to compare the rest by itself."""
+    """Find candidates in xyz (N, 3).
+
+    Returns points in view, ground, labels, boxes by stage (K, 7) and ms by step. A given ground
+    replaces RANSAC's, to compare the other steps separately.
+    """
     t = [perf_counter()]
     homogeneous = np.column_stack([xyz, np.ones(len(xyz))]) @ projection.T
     depth = homogeneous[:, 2]

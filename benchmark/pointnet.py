@@ -1,4 +1,4 @@
-"""Paper C's detector: the network beside PointNet++, and the steps of the whole detector."""
+"""Paper C's network compared with PointNet++, and the steps of the whole detector."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from rich.table import Table
 
 from benchmark.plain_pointnet2 import PlainPointNet2
-from benchmark.timing import Calls, interleaved
+from benchmark.timing import Calls, time_interleaved
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
@@ -31,8 +31,11 @@ NETWORK, WHOLE = 40.0, 120.0  # ms, targets
 
 
 def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
-    """Medians over whole scans. The networks have random weights, of which time does not depend,
-    and read COUNT clusters of a scan, or as many as it has."""
+    """Measure median times over whole scans.
+
+    The networks have random weights, which do not affect time, and process COUNT clusters of a
+    scan, or as many as it has.
+    """
     torch.manual_seed(0)
     config = make_pointnet_config()
     networks = {name: TorchPointNet(fuse_norms(make_pointnet(make_pointnet_config(name))))
@@ -50,8 +53,8 @@ def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
         calls: Calls = {name: partial(predict, network, some) for name, network in networks.items()}
         calls["plain PointNet++ (SSG)"] = partial(_plain, plain, some, config.points)
         calls["detector"] = partial(detector, scan)
-        interleaved(calls, 1)
-        ms, said = interleaved(calls, repeat)
+        time_interleaved(calls, 1)
+        ms, said = time_interleaved(calls, repeat)
         rows.append(ms)
         steps.append([said["detector"].timings[step] for step in STEPS])
         counts.append((len(some), len(every), len(scan)))
@@ -68,7 +71,7 @@ def _plain(network: PlainPointNet2, clusters: Clusters, count: int) -> torch.Ten
 
 
 def print_pointnet(content: dict) -> None:
-    """One table; the detector looks at all clusters."""
+    """Print one table; the detector processes all clusters."""
     ms = content["ms"]
     table = Table(title=f"Paper C's network, ms for {content['clusters']:.0f} clusters, "
                         f"{content['threads']} CPU threads, random weights")

@@ -1,4 +1,4 @@
-"""Precision at a recall, of single frames and of tracks, by centres within 1 m."""
+"""Precision at given recall, of single frames and of tracks, by centres within 1 m."""
 
 from __future__ import annotations
 
@@ -18,21 +18,22 @@ from lidar_perception.scoring.tracking.pairs import (
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 
 if TYPE_CHECKING:
-    from benchmark.tracking import Seen, Step
+    from benchmark.tracking import Step, TrackedFrame
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Of one drive and class: scores (K,) of all boxes that count, hits (K,) bool, and how many
-    labels there are to find."""
+    """Scores (K,) and hits (K,) bool of the counted boxes of a drive and class, and its labels."""
 
     scores: np.ndarray
     hits: np.ndarray
     labels: int
 
 
-def curve_of(drive: list[Seen], step: Step, classes: tuple[str, ...]) -> dict[str, Curve]:
-    """By class; each label belongs to the best box that is like it."""
+def make_curves(
+    drive: list[TrackedFrame], step: Step, classes: tuple[str, ...]
+) -> dict[str, Curve]:
+    """Make the curve by class; each label belongs to its best matching box."""
     parts: dict[str, list[Curve]] = {name: [] for name in classes}
     for seen in drive:
         ids, found = step(seen)
@@ -57,9 +58,13 @@ def _of_frame(pairs: Pairs) -> Curve:
     return Curve(pairs.scores[counts], hits[counts], int((~pairs.ignored).sum()))
 
 
-def precisions(curves: Sequence[Curve], recalls: Sequence[float], draws: np.ndarray) -> np.ndarray:
-    """(D, R) the best precision at each of R recalls or beyond, 0 where it is not reached, in D
-    draws (D, N) of the N drives: how often each is in it."""
+def compute_precisions(
+    curves: Sequence[Curve], recalls: Sequence[float], draws: np.ndarray
+) -> np.ndarray:
+    """Return the best precision (D, R) at each of R recalls or above, 0 if not reached.
+
+    draws (D, N) holds how often each of the N drives is drawn.
+    """
     order = np.argsort(-np.concatenate([c.scores for c in curves]), kind="stable")
     hit = np.concatenate([c.hits for c in curves])[order]
     drive = np.repeat(np.arange(len(curves)), [len(c.scores) for c in curves])[order]

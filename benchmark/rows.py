@@ -1,8 +1,8 @@
-"""What every measurement gives: a plain dict with rows for the table and the JSON file.
+"""Results of measurements: plain dicts with rows for the table and the JSON file.
 
-A row has the peer's name, peer_ms and ours_ms, and the figure itself: value with its unit, the
-target where there is one, whether it is met, in how many frames the results are the same, and
-how many points differ in the others.
+A row has the peer's name, peer_ms and ours_ms, value with its unit, the target if any and whether
+it is met, the number of frames with equal results, and the number of points that differ in the
+others.
 """
 
 from __future__ import annotations
@@ -13,39 +13,39 @@ from rich.text import Text
 from lidar_perception.runs.terminal import console
 
 
-def measured(title: str, frames: int, points: float, rows: list[dict], **more) -> dict:
+def make_measurement(title: str, frames: int, points: float, rows: list[dict], **more) -> dict:
     return {"title": title, "frames": frames, "points": round(points), "rows": rows, **more}
 
 
-def row(name: str, *, peer_ms: float | None = None, ours_ms: float | None = None,
-        value: float | None = None, unit: str = "x", target: float | None = None,
-        same: int | None = None, differ: int | None = None, note: str = "") -> dict:
-    return with_target(dict(name=name, peer_ms=peer_ms, ours_ms=ours_ms, value=value, unit=unit,
-                            target=None, met=None, same=same, differ=differ, note=note), target)
+def make_row(name: str, *, peer_ms: float | None = None, ours_ms: float | None = None,
+             value: float | None = None, unit: str = "x", target: float | None = None,
+             same: int | None = None, differ: int | None = None, note: str = "") -> dict:
+    return add_target(dict(name=name, peer_ms=peer_ms, ours_ms=ours_ms, value=value, unit=unit,
+                           target=None, met=None, same=same, differ=differ, note=note), target)
 
 
-def with_target(content: dict, target: float | None) -> dict:
-    """The row with its target: a least value of unit "x", times faster, and a limit of others."""
+def add_target(content: dict, target: float | None) -> dict:
+    """Return the row with its target: a minimum for unit "x" (times faster), else a maximum."""
     value, met = content["value"], None
     if target is not None and value is not None:
         met = value >= target if content["unit"] == "x" else value < target
     return {**content, "target": target, "met": met}
 
 
-def against(name: str, ms: dict[str, float], target: float | None = None,
-            same: int | None = None, differ: int | None = None) -> dict:
-    """How many times faster ours is than the peer of that name."""
-    return row(name, peer_ms=ms[name], ours_ms=ms["ours"], value=ms[name] / ms["ours"],
-               target=target, same=same, differ=differ)
+def compute_speedup(name: str, ms: dict[str, float], target: float | None = None,
+                    same: int | None = None, differ: int | None = None) -> dict:
+    """Return how many times faster ours is than the named peer."""
+    return make_row(name, peer_ms=ms[name], ours_ms=ms["ours"], value=ms[name] / ms["ours"],
+                    target=target, same=same, differ=differ)
 
 
-def value_text(value: float | None, unit: str) -> str:
+def format_value(value: float | None, unit: str) -> str:
     if value is None:
         return ""
     return {"x": f"{value:.1f}x", "": f"{value:.2f}"}.get(unit, f"{value:.0f} {unit}")
 
 
-def target_text(target: float | None, unit: str) -> str:
+def format_target(target: float | None, unit: str) -> str:
     if target is None:
         return ""
     return f"{target:g}x" if unit == "x" else f"< {target:g} {unit}".rstrip()
@@ -54,13 +54,13 @@ def target_text(target: float | None, unit: str) -> str:
 def print_measured(content: dict) -> None:
     table = Table(title=f"{content['title']} ({content['frames']} frames, "
                         f"{content['points']} points)")
-    for name in ("beside", "its ms", "our ms", "measured", "target", "met", "same"):
-        table.add_column(name, justify="left" if name == "beside" else "right")
+    for name in ("peer", "its ms", "our ms", "measured", "target", "met", "same"):
+        table.add_column(name, justify="left" if name == "peer" else "right")
     for r in content["rows"]:
         met = "" if r["met"] is None else "yes" if r["met"] else Text("no", "red")
         table.add_row(r["name"], _ms(r["peer_ms"]), _ms(r["ours_ms"]),
-                      r["note"] or value_text(r["value"], r["unit"]),
-                      target_text(r["target"], r["unit"]), met,
+                      r["note"] or format_value(r["value"], r["unit"]),
+                      format_target(r["target"], r["unit"]), met,
                       "" if r["same"] is None else f"{r['same']} of {content['frames']}")
     console.print(table)
     for r in content["rows"]:
@@ -69,7 +69,7 @@ def print_measured(content: dict) -> None:
 
 
 def print_ground(content: dict) -> None:
-    """The ground methods by protocol."""
+    """Print the ground methods by protocol."""
     table = Table(title=f"Ground on {content['scans']} labelled scans (SemanticKITTI)")
     for name in ("method", "precision", "recall", "F1", "ms"):
         table.add_column(name, justify="left" if name == "method" else "right")
@@ -87,8 +87,8 @@ def print_ground(content: dict) -> None:
 
 
 def print_planes(content: dict) -> None:
-    """How far scikit-learn's planes are from ours."""
-    table = Table(title="scikit-learn's plane beside ours: median (max); the number of frames in "
+    """Print the differences between scikit-learn's planes and ours."""
+    table = Table(title="scikit-learn's plane and ours: median (max); the number of frames in "
                         "which ours : its has more inliers")
     for name in ("scikit-learn", "trials", "plane", "cm", "degrees", "more inliers"):
         table.add_column(name, justify="left" if name in ("scikit-learn", "plane") else "right")

@@ -1,4 +1,4 @@
-"""One scan of the simulator with its street, stage by stage."""
+"""One simulated scan with its street, stage by stage."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmark.rows import measured, row
+from benchmark.rows import make_measurement, make_row
 from benchmark.timing import Clock
 from lidar_perception.runs.terminal import show_progress
 from lidar_perception.simulation.raycast import cast_rays
@@ -21,7 +21,7 @@ SHARED_SCANS = 10  # of one street, as `train --data-street-scans 10` draws them
 
 
 def measure_simulation(streets: int, repeat: int) -> dict:
-    """Full HDL-64E scans of the first `streets` streets with MIN_ACTORS things in sight."""
+    """Measure full HDL-64E scans of the first `streets` streets with MIN_ACTORS visible objects."""
     title = "Simulator, HDL-64E"
     scenes = _busy(streets)
     first = _calls(*scenes[0])
@@ -34,13 +34,14 @@ def measure_simulation(streets: int, repeat: int) -> dict:
         solids.append(len(calls["scene"]().solids))
     ms = clock.medians()
     total = sum(ms.values())
-    rows = [row(f"({name})", ours_ms=ms[name]) for name in ms]
-    rows.append(row("(one scan of a new street)", ours_ms=total, value=total, unit="ms",
+    rows = [make_row(f"({name})", ours_ms=ms[name]) for name in ms]
+    rows.append(make_row("(one scan of a new street)", ours_ms=total, value=total, unit="ms",
                     target=TARGET_MS))
     shared = total - ms["street"] * (1 - 1 / SHARED_SCANS)
-    rows.append(row(f"(one of {SHARED_SCANS} scans of a street)", ours_ms=shared, value=shared,
+    rows.append(make_row(f"(one of {SHARED_SCANS} scans of a street)", ours_ms=shared, value=shared,
                     unit="ms"))
-    return measured(title, len(scenes), np.median(points), rows, solids=float(np.median(solids)))
+    return make_measurement(title, len(scenes), np.median(points), rows,
+                            solids=float(np.median(solids)))
 
 
 def _busy(count: int) -> list[tuple[int, Scene]]:

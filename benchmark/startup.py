@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmark.rows import measured, row
+from benchmark.rows import make_measurement, make_row
 
 CODE = {
     "fused": "import lidar_perception; lidar_perception.load_detector(device='cpu')",
@@ -40,16 +40,16 @@ def measure_startup(repeat: int, cold: tuple[str, ...] = ("fused", "clustering")
     """
     runs = {name: np.median([_start(code) for _ in range(repeat)], axis=0)
             for name, code in CODE.items()}
-    rows = [row(WITH_TORCH, peer_ms=1e3 * runs[WITH_TORCH][0], ours_ms=1e3 * runs["fused"][0],
+    rows = [make_row(WITH_TORCH, peer_ms=1e3 * runs[WITH_TORCH][0], ours_ms=1e3 * runs["fused"][0],
                 value=runs[WITH_TORCH][0] / runs["fused"][0])]
-    rows += [row(f"{name}, peak memory", value=memory, unit="MB")
+    rows += [make_row(f"{name}, peak memory", value=memory, unit="MB")
              for name, (_, memory) in runs.items()]
     for name in cold:
         with tempfile.TemporaryDirectory() as folder:
             seconds, _ = _start(CODE[name], NUMBA_CACHE_DIR=folder)
-        rows.append(row(f"{name}, compiled from nothing", ours_ms=1e3 * seconds))
+        rows.append(make_row(f"{name}, compiled from nothing", ours_ms=1e3 * seconds))
     title = f"Start of a process, CPU ms at a load of {os.getloadavg()[0]:.1f}"
-    return measured(title, repeat, 0, rows)
+    return make_measurement(title, repeat, 0, rows)
 
 
 def _start(code: str, **variables: str) -> tuple[float, float]:

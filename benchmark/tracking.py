@@ -1,4 +1,4 @@
-"""Our tracker beside a plain reading of AB3DMOT, on the same detections with the same poses."""
+"""Our tracker against a plain AB3DMOT, on the same detections and poses."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections, GroundTruth
 
-OPERATING = ScoreParams().car  # from this score on the peer is given detections; it weighs none
+OPERATING = ScoreParams().car  # lowest score for the peer, which ignores scores
 SHOWN = ("HOTA", "DetA", "AssA", "MOTA", "sAMOTA", "AMOTA", "switches", "fragments", "labels",
          "true_tracks", "tracks")
-Step = Callable[["Seen"], tuple[np.ndarray, Detections]]
+Step = Callable[["TrackedFrame"], tuple[np.ndarray, Detections]]
 
 
 @dataclass(frozen=True)
-class Seen:
-    """One frame: what a detector found, weak detections too, and the labels, with track ids."""
+class TrackedFrame:
+    """One frame: detections, weak ones included, and labels with track ids."""
 
     found: Detections
     truth: GroundTruth
@@ -41,13 +41,12 @@ class Seen:
 
 
 def measure_recording(recording: Recording) -> dict:
-    """What PointPillars finds in the drives of a recording, tracked by both; {} without track ids
-    in the labels."""
+    """Track PointPillars' detections in a recording with both trackers; {} without track ids."""
     if not recording.frames or not recording.frames[0].sequence:
         return {}
     detector = open_detector("pointpillars", min_score=MIN_SCORE,
                              sensor_height=recording.frames[0].sensor_height)
-    drives: dict[str, list[Seen]] = {}
+    drives: dict[str, list[TrackedFrame]] = {}
     source = choose_ego_source(recording)
     for frame in show_progress(recording, "detecting", len(recording)):
         truth, frame = frame.truth(), frame.with_cached_scan()
@@ -55,35 +54,43 @@ def measure_recording(recording: Recording) -> dict:
             if frame.sequence not in drives:
                 pose_of = make_pose_reader(source)
             drives.setdefault(frame.sequence, []).append(
-                Seen(detector(frame.load()).detections, truth, frame.stamp_ns, pose_of(frame),
-                     frame.calibration()))
+                TrackedFrame(
+                    detector(frame.load()).detections,
+                    truth,
+                    frame.stamp_ns,
+                    pose_of(frame),
+                    frame.calibration(),
+                )
+            )
     return measure_tracking(drives) if drives else {}
 
 
-def measure_tracking(drives: Mapping[str, Sequence[Seen]],
+def measure_tracking(drives: Mapping[str, Sequence[TrackedFrame]],
                      params: TrackingParams = TrackingParams()) -> dict:
-    """By "ours" and "plain AB3DMOT": the scores of TrackingReport, by centres, and ms, the median
-    time of a frame."""
-    return {name: _measured(drives, make) for name, make in (
+    """Measure both trackers, "ours" and "plain AB3DMOT".
+
+    Returns the scores of TrackingReport by centres, and ms, the median time per frame.
+    """
+    return {name: _measure(drives, make) for name, make in (
         ("plain AB3DMOT", lambda: peer(PlainAb3dmot())), ("ours", lambda: tracker(params)))}
 
 
 def peer(plain: PlainAb3dmot, operating: float = OPERATING) -> Step:
-    """One drive by the peer, which gets detections from the score `operating` on."""
+    """Track one drive with the peer, which gets detections of score `operating` or more."""
     return lambda seen: plain(seen.found[seen.found.scores >= operating], seen.pose)
 
 
 def tracker(params: TrackingParams) -> Step:
-    """One drive by our tracker."""
+    """Track one drive with our tracker."""
     ours = Tracker(params)
 
-    def step(seen: Seen) -> tuple[np.ndarray, Detections]:
+    def step(seen: TrackedFrame) -> tuple[np.ndarray, Detections]:
         tracks = ours(seen.found, seen.stamp_ns, seen.pose)
         return tracks.ids, tracks.detections
     return step
 
 
-def _measured(drives: Mapping[str, Sequence[Seen]], make: Callable[[], Step]) -> dict:
+def _measure(drives: Mapping[str, Sequence[TrackedFrame]], make: Callable[[], Step]) -> dict:
     report, ms = TrackingReport(), []
     for name, frames in drives.items():
         step = make()
@@ -97,7 +104,7 @@ def _measured(drives: Mapping[str, Sequence[Seen]], make: Callable[[], Step]) ->
 
 
 def print_tracking(content: dict) -> None:
-    """One row a class and tracker."""
+    """Print a row per class and tracker."""
     table = Table(title="Tracks by centres, similarity 1 - d / 2 m")
     for name in ("class", "tracker", *SHOWN):
         table.add_column(name, justify="left" if name in ("class", "tracker") else "right")

@@ -13,13 +13,13 @@ from click.testing import CliRunner
 from samples import object_folder, scene, walker_label
 
 from benchmark import busy, ground, peers, plain_euclidean, startup
-from benchmark.clustering import dbscan_times, measure_dbscan, same_clusters
+from benchmark.clustering import have_same_clusters, measure_dbscan, measure_dbscans
 from benchmark.detection import measure_detection, measure_engines, print_detection
 from benchmark.plain_pointnet2 import ball, farthest
 from benchmark.pointnet import measure_pointnet, print_pointnet
-from benchmark.rows import print_ground, print_measured, row, target_text, value_text
+from benchmark.rows import format_target, format_value, make_row, print_ground, print_measured
 from benchmark.startup import measure_startup
-from benchmark.timing import Clock, in_child, interleaved
+from benchmark.timing import Clock, run_in_child, time_interleaved
 from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import EuclideanParams
 from lidar_perception.data.frame import Frame, PointTruth
@@ -47,8 +47,8 @@ def nothing_installed(monkeypatch):
 
 def test_contenders_run_in_turn_after_untimed_warm_up():
     called = []
-    ms, results = interleaved({name: lambda name=name: called.append(name) or name.upper()
-                               for name in "abc"}, 3)
+    ms, results = time_interleaved({name: lambda name=name: called.append(name) or name.upper()
+                                    for name in "abc"}, 3)
     assert called == list("abc" * 3)
     assert results == {"a": "A", "b": "B", "c": "C"} and ms.keys() == results.keys()
     called.clear()
@@ -64,8 +64,8 @@ def test_the_peers_of_dbscan_give_our_clusters(place):
     if peer.missing():
         pytest.skip(f"{peer.package} is {peer.missing()}")
     arguments = ([place], [cloud()], 1, "test")
-    _, same, differ = (in_child(dbscan_times, *arguments) if peer == peers.WHEEL
-                       else dbscan_times(*arguments))
+    _, same, differ = (run_in_child(measure_dbscans, *arguments) if peer == peers.WHEEL
+                       else measure_dbscans(*arguments))
     assert same[peer.name] == 1 and differ[peer.name] == 0
 
 
@@ -80,19 +80,19 @@ def test_the_plain_euclidean_gives_our_clusters(threshold):
 def test_same_clusters_compares_noise_and_core_partition():
     core = np.array([True, True, True, False, False])
     ours = np.array([1, 1, 2, 2, 0])
-    assert same_clusters(np.array([7, 7, 3, 7, 0]), ours, core)      # numbers, and a border point
-    assert not same_clusters(np.array([7, 7, 3, 3, 4]), ours, core)  # noise
-    assert not same_clusters(np.array([7, 7, 7, 7, 0]), ours, core)  # joined
-    assert not same_clusters(np.array([7, 8, 3, 3, 0]), ours, core)  # cut
+    assert have_same_clusters(np.array([7, 7, 3, 7, 0]), ours, core)  # numbers, and a border point
+    assert not have_same_clusters(np.array([7, 7, 3, 3, 4]), ours, core)  # noise
+    assert not have_same_clusters(np.array([7, 7, 7, 7, 0]), ours, core)  # joined
+    assert not have_same_clusters(np.array([7, 8, 3, 3, 0]), ours, core)  # cut
 
 
 @pytest.mark.parametrize("unit, target, good, bad, text", [
     ("x", 12, 12.0, 11.9, "12x"), ("ms", 60, 59.9, 60.0, "< 60 ms"), ("", 1.1, 1.0, 1.1, "< 1.1")])
 def test_a_missed_target_is_shown(unit, target, good, bad, text):
-    assert row("a", value=good, unit=unit, target=target)["met"] is True
-    assert row("a", value=bad, unit=unit, target=target)["met"] is False
-    assert row("a", value=None, unit=unit, target=target)["met"] is None
-    assert target_text(target, unit) == text and value_text(None, unit) == ""
+    assert make_row("a", value=good, unit=unit, target=target)["met"] is True
+    assert make_row("a", value=bad, unit=unit, target=target)["met"] is False
+    assert make_row("a", value=None, unit=unit, target=target)["met"] is None
+    assert format_target(target, unit) == text and format_value(None, unit) == ""
 
 
 def test_peers_that_are_not_installed_are_said_to_be(nothing_installed, capsys):
@@ -117,13 +117,13 @@ def test_ground_scores_do_without_the_libraries(nothing_installed, capsys):
 
 
 def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsys, monkeypatch):
-    points, ran, experts = scene(), {}, pointpillars.experts
+    points, ran, experts = scene(), {}, pointpillars.run_experts
 
     def seen(frame, config, *given):
         made = experts(frame, config, *given)
         ran[config.version] = tuple(column is not None for column in made)
         return made
-    monkeypatch.setattr(pointpillars, "experts", seen)
+    monkeypatch.setattr(pointpillars, "run_experts", seen)
     content = measure_detection([PointCloud(points[:, :3], points[:, 3])], 1, ("compact",))
     print_detection(json.loads(json.dumps(content)))
     shown = capsys.readouterr().out
@@ -144,7 +144,9 @@ def test_engines_are_timed_and_compared(one_thread, capsys):
     content = measure_engines([PointCloud(points[:, :3], points[:, 3])], 1, ("pointpillars",))
     print_measured(json.loads(json.dumps(content)))
     assert "around, engine torch" in " ".join(capsys.readouterr().out.split())
-    assert [(row["same"], row["value"] > 0) for row in content["rows"]] == [(1, True)] * 2
+    assert [(make_row["same"], make_row["value"] > 0) for make_row in content["rows"]] == [
+        (1, True)
+    ] * 2
 
 
 @pytest.mark.no_cover

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmark.plain_ab3dmot import PlainAb3dmot
-from benchmark.tracking import Seen, measure_tracking
+from benchmark.tracking import TrackedFrame, measure_tracking
 from lidar_perception.types import CLASSES, Detections, GroundTruth
 
 CAR = CLASSES.index("Car")
@@ -37,7 +37,7 @@ def test_it_follows_a_straight_way_and_poses_make_what_stands_stand():
 
 
 def test_both_trackers_are_scored_on_the_same_frames():
-    frames = [Seen(one(10 + i), GroundTruth.of(one(10 + i).boxes, [CAR], [{
+    frames = [TrackedFrame(one(10 + i), GroundTruth.of(one(10 + i).boxes, [CAR], [{
         "track_id": 5, "occluded": 0, "truncated": 0.0}]), 10**18 + i * 10**8) for i in range(12)]
     content = measure_tracking({"a": frames})
     assert list(content) == ["plain AB3DMOT", "ours"]
@@ -68,14 +68,16 @@ def test_a_recording_with_track_ids_is_tracked_by_both_and_one_without_by_none(m
 
 
 def test_intervals_of_drives_are_paired_and_precision_is_that_of_the_best_scores():
-    from benchmark.drives import _interval, resampled
-    from benchmark.precision import Curve, precisions
+    from benchmark.drives import _interval, resample
+    from benchmark.precision import Curve, compute_precisions
     values = [1.0, 2.0, 4.0]
-    means = resampled(values, lambda chosen: sum(chosen) / 3)
-    np.testing.assert_array_equal(means, resampled(values, lambda chosen: sum(chosen) / 3))
+    means = resample(values, lambda chosen: sum(chosen) / 3)
+    np.testing.assert_array_equal(means, resample(values, lambda chosen: sum(chosen) / 3))
     low, high = _interval(means)
     assert 1.0 <= low < np.mean(values) < high <= 4.0
     good = Curve(np.array([0.9, 0.8, 0.2]), np.array([True, False, True]), 4)
     bad = Curve(np.array([0.95, 0.5]), np.array([False, False]), 0)
-    found = precisions([good, bad], [0.25, 0.5, 0.75], np.array([[1, 0], [2, 0], [1, 1], [0, 1]]))
+    found = compute_precisions(
+        [good, bad], [0.25, 0.5, 0.75], np.array([[1, 0], [2, 0], [1, 1], [0, 1]])
+    )
     np.testing.assert_allclose(found, [[1, 2 / 3, 0], [1, 2 / 3, 0], [1 / 2, 2 / 5, 0], [0, 0, 0]])
