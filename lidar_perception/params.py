@@ -139,7 +139,7 @@ class PerceptionRobotParams(DetectionNodeParams):
 
 @dataclass(frozen=True)
 class TrackInputParams(CloudNodeParams):
-    """What the tracker has besides its numbers. Each detection counts, so some may wait."""
+    """Input parameters of the tracker. Its queue is longer, because no detection may be skipped."""
 
     input: ReceptionParams = ReceptionParams(queue=10)
     output: TrackMarkerParams = TrackMarkerParams()

@@ -159,7 +159,7 @@ def _find_patches(xyz, intensity, settings):
 def _fit_ground(points, state, size, zone, plane, settings):
     """Fit the ground of a patch: set the states of its points (3, >= size), and the plane.
 
-    The plane is left as it is, that of the patch before, if there are no points to fit it to.
+    Without points to fit, the plane keeps the values of the previous patch.
     """
     for i in range(size):
         state[i] = OTHER
