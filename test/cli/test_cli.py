@@ -1,4 +1,4 @@
-"""The command line: help, results, exit codes and one line for what is wrong."""
+"""The command line: help, results, exit codes and error lines."""
 
 from __future__ import annotations
 

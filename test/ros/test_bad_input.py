@@ -1,4 +1,4 @@
-"""No message ends a node: each bad cloud becomes a diagnostic, and the next good one is served."""
+"""Invalid clouds become diagnostics, and the node processes the next valid one."""
 
 from __future__ import annotations
 

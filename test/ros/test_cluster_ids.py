@@ -1,4 +1,4 @@
-"""A box can be traced to its points: it says the cluster_id of the cloud, whoever gave it."""
+"""Cluster ids of candidates: each one names the cluster_id of the cloud."""
 
 from __future__ import annotations
 

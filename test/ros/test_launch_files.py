@@ -1,4 +1,4 @@
-"""What the launch files start, with stand-ins for launch and launch_ros."""
+"""Nodes and parameters that the launch files start, with stand-ins for launch and launch_ros."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Managed nodes, driven over DDS as Nav2's lifecycle manager does: a change of state, then the
-state is asked for."""
+"""Managed nodes, driven over DDS as by Nav2's lifecycle manager."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all nodes have in common: parameters, signals, time, markers."""
+"""Behaviour that all nodes share: parameters, signals, time, markers."""
 
 from __future__ import annotations
 

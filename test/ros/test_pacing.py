@@ -1,4 +1,4 @@
-"""A replay that loses nothing: when the next cloud may be sent, whatever the graph answers."""
+"""Laws of the player's pacing: when the next cloud may be sent."""
 
 from __future__ import annotations
 

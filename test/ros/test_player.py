@@ -1,4 +1,4 @@
-"""bag_player and bag_recorder: what is in the bag is what arrives, when it should."""
+"""bag_player and bag_recorder: the messages of a bag arrive unchanged and in time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a node makes of other people's drivers: nothing is lost unsaid, and silence is said."""
+"""Reception of clouds from other drivers: losses are counted, silence is reported."""
 
 from __future__ import annotations
 

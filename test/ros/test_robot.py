@@ -1,4 +1,4 @@
-"""What belongs to the robot, over DDS: the crop before everything, and TF as others publish it."""
+"""The robot's crop, and TF from other nodes, over DDS."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Frames and motion in the nodes, each in this process: tilted sensors, results and clicks in other
-frames, clouds that are moved to their stamp."""
+"""Frames and motion in the nodes: tilted sensors, results and clicks in other frames."""
 
 from __future__ import annotations
 

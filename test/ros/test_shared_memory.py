@@ -1,4 +1,4 @@
-"""What Fast DDS keeps in shared memory: the profile of a node, and what killed ones have left."""
+"""Shared memory of Fast DDS: the profile of a node, and cleaning up after killed processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A node's process ends at a signal with code 0, whatever holds the interpreter's lock."""
+"""A node's process ends with code 0 at a signal, even if a library holds the lock."""
 
 import importlib.util
 import signal

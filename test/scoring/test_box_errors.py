@@ -1,4 +1,4 @@
-"""How found boxes differ from the true ones: what was put in comes out."""
+"""Box errors: known differences are measured."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""evaluate detection: result files, checkpoints, splits, and what is wrong with them."""
+"""evaluate detection: result files, checkpoints, splits, and invalid ones."""
 
 from __future__ import annotations
 

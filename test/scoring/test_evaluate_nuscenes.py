@@ -1,4 +1,4 @@
-"""evaluate nuscenes: result files, checkpoints, scenes, and what is wrong with them."""
+"""evaluate nuscenes: result files, checkpoints, scenes, and invalid ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Laws of the one loop: whoever measures, the results are the same, in the order of the frames."""
+"""The scoring loop: results are equal and ordered in one process, in many, and on Dask."""
 
 from __future__ import annotations
 
