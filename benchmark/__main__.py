@@ -109,8 +109,7 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     content["startup"] = measure_startup(repeat)
     print_measured(content["startup"])
     if graph:
-        content["graph"] = {name: measure_graph(recording, single)
-                            for name, single in (("three_nodes", False), ("one_node", True))}
+        content["graph"] = measure_graph(recording)
         print_graph(content["graph"])
     if json_file:
         write_text(json_file, json.dumps(content, indent=1))

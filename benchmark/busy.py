@@ -37,7 +37,7 @@ def measure_busy(scans: list[PointCloud], repeat: int) -> dict:
                    for way, environment in WAYS.items()}
         for _ in show_progress(range(repeat), title, repeat):
             for busy in (0, BUSY):
-                with _run_busy_processes(busy):
+                with run_busy_processes(busy):
                     for way, worker in workers.items():
                         ms[way, busy] += worker.submit(_measure_times).result()
     median = {key: float(np.median(values)) for key, values in ms.items()}
@@ -94,7 +94,7 @@ def _measure_times() -> list[float]:
 
 
 @contextmanager
-def _run_busy_processes(count: int) -> Iterator[None]:
+def run_busy_processes(count: int) -> Iterator[None]:
     """Run the given number of busy processes meanwhile."""
     others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
     try:

@@ -1,38 +1,70 @@
-"""The graph of nodes over DDS."""
+"""The graph of nodes over DDS: latency, CPU time and memory."""
 
 from __future__ import annotations
 
+import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 
+from benchmark.busy import run_busy_processes
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.frame import Recording
 from lidar_perception.data.to_bag import write_bag
+from lidar_perception.detectors.fused.params import FusedDetectorParams
 from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.wire.topics import POINTS
 
+CANDIDATES: dict[str, Any] = {"detector": "candidates", "params": PAPER}
+FUSED: dict[str, Any] = {"detector": "fused", "params": FusedDetectorParams()}
+RUNS: dict[str, tuple[dict[str, Any], int]] = {  # arguments of replay(), and busy processes
+    "candidates, a process per node": (CANDIDATES | {"processes": True}, 0),
+    "candidates, one process": (CANDIDATES | {"processes": False}, 0),
+    "candidates, one node": (CANDIDATES | {"single": True, "processes": True}, 0),
+    "fused, a process per node": (FUSED | {"processes": True}, 0),
+    "fused, one process": (FUSED | {"processes": False}, 0),
+    "fused, one process beside a busy one": (FUSED | {"processes": False}, 1),
+}
 
-def measure_graph(recording: Recording, single: bool) -> dict:
-    """Measure latency, losses and memory of the nodes at 10 Hz, with the recorder subscribed."""
+
+def measure_graph(recording: Recording) -> dict[str, dict]:
+    """Replay a recording at 10 Hz through the graphs of RUNS, one after the other.
+
+    No cloud is lost: a graph that cannot keep up gets its clouds later, see `speed`.
+
+    Returns:
+        {graph: clouds, results, speed (1 = real time), latency_ms, cpu_ms (CPU time of all
+        processes per cloud), memory_mb, and the load average before the run}
+    """
     from lidar_perception.nodes.replay.graph_replay import replay
+    runs = {}
     with tempfile.TemporaryDirectory() as folder:
-        drive, out = Path(folder) / "drive", Path(folder)
+        drive = Path(folder) / "drive"
         write_bag(drive, show_progress(recording, "writing a bag", len(recording)))
         with Bag(drive) as bag:
             clouds = bag.counts[POINTS]
-        content = replay(drive, clouds, out, PAPER, single=single)
-    return {k: content[k] for k in ("clouds", "results", "latency_ms", "memory_mb", "ms")}
+        for i, (name, (arguments, busy)) in enumerate(RUNS.items()):
+            load = os.getloadavg()[0]
+            with run_busy_processes(busy):
+                content = replay(drive, clouds, Path(folder) / str(i), **arguments)
+            runs[name] = {key: content[key] for key in ("clouds", "results", "latency_ms",
+                                                        "memory_mb", "stage_ms")} | {
+                "speed": 1 / content["slower"], "load": load,
+                "cpu_ms": sum(content["cpu_ms_by_process"].values())}
+    return runs
 
 
-def print_graph(content: dict) -> None:
+def print_graph(content: dict[str, dict]) -> None:
     table = Table(title="Nodes over DDS at 10 Hz")
-    for name in ("graph", "clouds", "lost", "median ms", "95 % under ms", "memory MB"):
+    for name in ("graph", "clouds", "lost", "speed", "median ms", "95 % under ms", "CPU ms",
+                 "memory MB", "load"):
         table.add_column(name, justify="left" if name == "graph" else "right")
     for name, run in content.items():
-        table.add_row(name.replace("_", " "), str(run["clouds"]),
-                      str(run["clouds"] - run["results"]), f"{run['latency_ms']['median']:.0f}",
-                      f"{run['latency_ms']['p95']:.0f}", f"{run['memory_mb']:.0f}")
+        table.add_row(name, str(run["clouds"]), str(run["clouds"] - run["results"]),
+                      f"{run['speed']:.2g}x", f"{run['latency_ms']['median']:.0f}",
+                      f"{run['latency_ms']['p95']:.0f}", f"{run['cpu_ms']:.0f}",
+                      f"{run['memory_mb']:.0f}", f"{run['load']:.1f}")
     console.print(table)

@@ -23,6 +23,7 @@ from benchmark.timing import Clock, run_in_child, time_interleaved
 from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import EuclideanParams
 from lidar_perception.data.frame import Frame, PointTruth
+from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.pointpillars import detector as pointpillars
 from lidar_perception.types import PointCloud
 
@@ -199,3 +200,24 @@ def test_the_command_writes_what_it_measured(nothing_installed, monkeypatch, tmp
     assert content["simulation"]["points"] > 50_000
     assert content["peers"]["open3d"] == "not installed"
     assert content["dbscan_in_view"]["rows"][0]["same"] == 1
+
+
+def test_graph_rows_have_speed_and_cpu_time(drive_bag, monkeypatch, capsys):
+    pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+    from benchmark.graph import RUNS, measure_graph, print_graph
+    from lidar_perception.nodes.replay import graph_replay
+    asked = []
+
+    def replay(drive, clouds, out, **arguments):
+        asked.append(arguments)
+        return {"clouds": clouds, "results": clouds - 1, "memory_mb": 900.0,
+                "latency_ms": {"median": 140.0, "p95": 180.0},
+                "stage_ms": {}, "slower": 4.0,
+                "cpu_ms_by_process": {"graph": 150.0, "bag_player": 10.0}}
+
+    monkeypatch.setattr(graph_replay, "replay", replay)
+    runs = measure_graph(open_recording(drive_bag))
+    assert [*runs] == [*RUNS] and asked == [arguments for arguments, _ in RUNS.values()]
+    assert {(run["speed"], run["cpu_ms"]) for run in runs.values()} == {(0.25, 160.0)}
+    print_graph(runs)
+    assert "0.25x" in capsys.readouterr().out

@@ -118,18 +118,23 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         # The detections have four subscribers: monitor, recorder, tracker, evaluator.
         rules += [f"{relative_name(stages[FINAL])}:={3 + scored}"]
         rules += [relative_name(ODOMETRY)] if poses == "recording" else []
-        cpu: dict[str, float] = {}  # from the first result on
+        first, last = CpuTimes(), CpuTimes()  # at the first and the last result
         running.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
                                          "wait_for": rules, "follow": [stages[FINAL]],
                                          "ahead": 0 if real_time else AHEAD})
+        memory: dict[str, float] = {}
         with make_progress() as bar:
             task = bar.add_task("replaying", total=clouds)
             before = -1
 
             def finished() -> bool:
                 bar.update(task, completed=monitor.frames)
-                if monitor.frames and not cpu:
-                    cpu.update(running.cpu_seconds(), watch=process_time(), frames=monitor.frames)
+                if monitor.frames > last.frames:
+                    last.read(monitor.frames, running)
+                    if not first.frames:
+                        first.read(monitor.frames, running)
+                if 2 * monitor.frames > clouds and not memory:
+                    memory.update(running.memory_mb())
                 return monitor.frames >= clouds
 
             while not finished() and (monitor.frames != before
@@ -145,10 +150,6 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
             monitor.spin_until(partial(caught_up, node), SILENCE_TIMEOUT_S)
         stage_ms = {node: float(ms) for node in graph
                     if (ms := monitor.get_value(node, "processing_ms_median"))}
-        memory = running.memory_mb()
-        timed = monitor.frames - cpu.pop("frames", 0)
-        cpu_ms = {name: 1e3 * (seconds - cpu.get(name, 0.0)) / max(timed, 1) for name, seconds in
-                  {**running.cpu_seconds(), "watch": process_time()}.items()}
         codes = running.stop(timeout=30)
     if failed := {node: code for node, code in codes.items() if code}:
         errors.print(Text(f"exit codes {failed}", "red") + f"; see {out}/logs")
@@ -158,6 +159,25 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
             "clouds": clouds, "results": monitor.frames,
             "latency_ms": {name: float(monitor.get_value("bag_player", f"latency_ms_{name}") or 0.0)
                            for name in ("median", "p95")},
-            "cpu_ms_by_process": cpu_ms, "stage_ms": stage_ms, "one_process": one_process,
+            "cpu_ms_by_process": last.ms_per_frame(first), "stage_ms": stage_ms,
+            "one_process": one_process,
             "slower": float(monitor.get_value("bag_player", "slower") or 1.0),
             "memory_mb": sum(memory.values()), "memory_mb_by_process": memory, "poses": poses}
+
+
+class CpuTimes:
+    """CPU time of the processes of a replay, and of this one as "watch", at a result."""
+
+    def __init__(self) -> None:
+        self.frames, self.seconds = 0, dict[str, float]()
+
+    def read(self, frames: int, running: Processes) -> None:
+        """Read the times at a number of results; processes that have ended keep theirs."""
+        self.frames = frames
+        self.seconds.update(running.cpu_seconds(), watch=process_time())
+
+    def ms_per_frame(self, earlier: CpuTimes) -> dict[str, float]:
+        """Return {process: its CPU time per result since an earlier reading, in ms}."""
+        frames = max(self.frames - earlier.frames, 1)
+        return {name: 1e3 * (seconds - earlier.seconds.get(name, 0.0)) / frames
+                for name, seconds in self.seconds.items()}
