@@ -78,3 +78,21 @@ def test_cache_is_found_where_numba_keeps_it(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True,
                           env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, check=True)
     assert done.stdout.split() == ["False", "True"]
+
+
+def test_second_process_compiles_during_the_block_and_is_waited_for(tmp_path, monkeypatch):
+    log, lines, done = tmp_path / "compile.log", [], tmp_path / "done"
+    code = ("import pathlib, time; time.sleep(0.3); print('said'); "
+            f"pathlib.Path({str(done)!r}).touch()")
+    monkeypatch.setattr(compiling, "_is_cached", lambda: True)
+    with compiling.compile_meanwhile(code, log, lines.append):
+        pass
+    assert not log.exists() and not lines  # nothing to compile
+    monkeypatch.setattr(compiling, "_is_cached", lambda: False)
+    with compiling.compile_meanwhile(code, log, lines.append):
+        assert not done.exists()
+    assert done.exists() and log.read_text() == "said\n"
+    assert len(lines) == 1 and str(log) in lines[0]
+    with pytest.raises(ZeroDivisionError), compiling.compile_meanwhile(
+            "import time; time.sleep(60)", log, lines.append):
+        raise ZeroDivisionError  # which does not wait
