@@ -140,7 +140,7 @@ def test_bad_clouds_are_reported_and_the_node_continues(tested, talker, found, s
     assert "Traceback" not in log and "Warning" not in log
 
 
-def test_thresholds_change_at_run_time_and_fixed_parameters_do_not(tested, talker, found, peer):
+def test_thresholds_change_at_run_time_others_are_fixed(tested, talker, found, peer):
     network = tested.network
     for name, value, words in [(f"{network}.weights", "other.safetensors", "read-only"),
                                (f"{network}.device", "cuda", "read-only"),
