@@ -84,8 +84,9 @@ def _runs(detector: str) -> Runs:
               help="Speed of the replay.")
 @click.option("--single", is_flag=True, help="Run ground, clusters and detector in one process "
                                              "instead of three.")
-@click.option("--processes", is_flag=True, help="Run each node in its own process, which is the "
-                                                "default on machines with more than four cores.")
+@click.option("--processes/--one-process", default=None,
+              help="Run each node in its own process, which is the default on machines with more "
+                   "than one core, or all nodes in one process, which saves memory.")
 @click.option("--real-time", is_flag=True, help="Play at the speed of the sensor, even if the "
                                                 "machine cannot keep up. Without it each cloud is "
                                                 "sent once those before it have their results.")
@@ -93,7 +94,7 @@ def _runs(detector: str) -> Runs:
 @device_option
 @settings_options(lambda given: [_runs(given.get("detector") or FUSED)], candidates=True)
 def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: int, rate: float,
-         single: bool, processes: bool, real_time: bool, range: str, device: str,
+         single: bool, processes: bool | None, real_time: bool, range: str, device: str,
          settings: Settings) -> None:
     """Replay a drive through the real nodes over DDS, and score the detections and their tracks.
 
@@ -134,7 +135,7 @@ def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: i
     with errors.status("loading compiled code (the first time: compiling, half a minute or more)"):
         own = _params_of(chosen, played)
     content = replay(drive, clouds, out, own, detector=detector, rate=rate, single=single,
-                     real_time=real_time, processes=processes or None)
+                     real_time=real_time, processes=processes)
     final = list_result_topics(single, detector)[FINAL]
     found, tracks = read_results(out / "result", final, TRACKS)
     calibration = next(iter(played)).calibration()

@@ -42,7 +42,7 @@ CLOUDS = {"~/input/points": relative_name(POINTS)}
 ODOMETRY_INPUT = {"~/input/odometry": relative_name(ODOMETRY)}
 TRACKER = "tracker"
 SEPARATOR = "---"  # between the arguments of the nodes of one process
-MAX_CORES_FOR_ONE_PROCESS = 4  # up to which the nodes of a graph share a process by default
+MAX_CORES_FOR_ONE_PROCESS = 1  # up to which the nodes of a graph share a process by default
 FINAL = "final"  # the last stage of a detector, whose boxes are its detections
 CLUSTERED = {"~/input/points": "clustering/output/points"}
 
@@ -150,10 +150,10 @@ def find_result_node(detector: str, single: bool = False) -> str:
 
 
 def prefers_one_process() -> bool:
-    """Return True on machines with few cores, where one process for a graph is the default.
+    """Return True on machines with one core, where one process for a graph is the default.
 
-    It saves the CPU time for copies of clouds and most of the memory. The nodes share the lock of
-    the interpreter, so on more cores one process for each node has less latency.
+    It saves copies of clouds and half the memory. The nodes share the lock of the interpreter: on
+    two loaded cores the tracker got detections so late that some were dropped and tracks ended.
     """
     return count_cores() <= MAX_CORES_FOR_ONE_PROCESS
 

@@ -93,7 +93,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
                    "clusters itself."),
     "processes": dict(default_value="auto", choices=["auto", "true", "false"], description="true: "
                       "one process for each node; false: one process for all nodes; auto: one on "
-                      "machines with up to four cores."),
+                      "machines with one core."),
     "autostart": dict(default_value="true", choices=["true", "false"], description="false: a "
                       "lifecycle manager configures and activates the nodes."),
     "respawn": dict(**SWITCHES, description="Restart a node that has ended, for example after a "
