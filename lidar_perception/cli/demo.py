@@ -84,9 +84,9 @@ def _runs(detector: str) -> Runs:
               help="Speed of the replay.")
 @click.option("--single", is_flag=True, help="Run ground, clusters and detector in one process "
                                              "instead of three.")
-@click.option("--processes/--one-process", default=None,
-              help="Run each node in its own process, which is the default on machines with more "
-                   "than one core, or all nodes in one process, which saves memory.")
+@click.option("--processes/--one-process", default=True, show_default=True,
+              help="Run each node in its own process, or all nodes in one process, which saves "
+                   "memory but is slower on loaded cores.")
 @click.option("--real-time", is_flag=True, help="Play at the speed of the sensor, even if the "
                                                 "machine cannot keep up. Without it each cloud is "
                                                 "sent once those before it have their results.")
@@ -94,7 +94,7 @@ def _runs(detector: str) -> Runs:
 @device_option
 @settings_options(lambda given: [_runs(given.get("detector") or FUSED)], candidates=True)
 def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: int, rate: float,
-         single: bool, processes: bool | None, real_time: bool, range: str, device: str,
+         single: bool, processes: bool, real_time: bool, range: str, device: str,
          settings: Settings) -> None:
     """Replay a drive through the real nodes over DDS, and score the detections and their tracks.
 

@@ -22,7 +22,6 @@ from typing import Any
 import yaml
 
 from lidar_perception.candidates.params import STEPS
-from lidar_perception.runs.machine import count_cores
 from lidar_perception.types import InputError
 from lidar_perception.wire.clouds import diagnose_packets, find_cloud_topics
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
@@ -42,7 +41,6 @@ CLOUDS = {"~/input/points": relative_name(POINTS)}
 ODOMETRY_INPUT = {"~/input/odometry": relative_name(ODOMETRY)}
 TRACKER = "tracker"
 SEPARATOR = "---"  # between the arguments of the nodes of one process
-MAX_CORES_FOR_ONE_PROCESS = 1  # up to which the nodes of a graph share a process by default
 FINAL = "final"  # the last stage of a detector, whose boxes are its detections
 CLUSTERED = {"~/input/points": "clustering/output/points"}
 
@@ -147,15 +145,6 @@ def find_result_node(detector: str, single: bool = False) -> str:
     """Return the node that publishes the detections of a detector."""
     node, = (SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[detector]
     return node
-
-
-def prefers_one_process() -> bool:
-    """Return True on machines with one core, where one process for a graph is the default.
-
-    It saves copies of clouds and half the memory. The nodes share the lock of the interpreter: on
-    two loaded cores the tracker got detections so late that some were dropped and tracks ended.
-    """
-    return count_cores() <= MAX_CORES_FOR_ONE_PROCESS
 
 
 def list_result_topics(single: bool = False, detector: str = "candidates") -> dict[str, str]:

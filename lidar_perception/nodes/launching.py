@@ -34,7 +34,6 @@ from lidar_perception.nodes.graph import (
     find_executable,
     find_expert_range,
     find_trackers,
-    prefers_one_process,
     relative_name,
 )
 from lidar_perception.nodes.node_parameters import find_node_parameters
@@ -91,9 +90,9 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
                      "the trackers and deskew."),
     "single": dict(**SWITCHES, description="Run each detector in one process that finds ground and "
                    "clusters itself."),
-    "processes": dict(default_value="auto", choices=["auto", "true", "false"], description="true: "
-                      "one process for each node; false: one process for all nodes; auto: one on "
-                      "machines with one core."),
+    "processes": dict(default_value="true", choices=["true", "false"], description="true: one "
+                      "process for each node; false: one process for all nodes, which saves memory "
+                      "but is slower on loaded cores."),
     "autostart": dict(default_value="true", choices=["true", "false"], description="false: a "
                       "lifecycle manager configures and activates the nodes."),
     "respawn": dict(**SWITCHES, description="Restart a node that has ended, for example after a "
@@ -205,8 +204,7 @@ def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
         # A parameter file may make any node read odometry; for the others the remapping is void.
         remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_INPUT}.items()],
     ) for node, remap in graph.items()]
-    if len(nodes) > 1 and (value["processes"] == "false" or (
-            value["processes"] == "auto" and prefers_one_process())):
+    if len(nodes) > 1 and value["processes"] == "false":
         words = [word for node in nodes for word in (SEPARATOR, *_list_arguments(**node))]
         return [*viewer, Node(executable=words[1], arguments=[*words[2:], SEPARATOR],
                               exec_name="graph", **common)]

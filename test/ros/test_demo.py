@@ -21,7 +21,6 @@ from lidar_perception.cli.demo import RECORD, demo
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.nodes import graph
 from lidar_perception.nodes.graph import FINAL, list_result_topics
 from lidar_perception.nodes.replay import graph_replay
 from lidar_perception.scoring.recorded import read_results
@@ -30,17 +29,16 @@ from lidar_perception.types import InputError
 FRAMES = 4  # tracks are confirmed
 
 
-def test_demo_scores_the_offline_result_in_one_process_and_in_many(drive_bag, make_bag, tmp_path,
-                                                                   monkeypatch):
+def test_demo_scores_the_offline_result_in_one_process_and_in_many(drive_bag, make_bag,
+                                                                   tmp_path):
     """Tracks are equal to the byte."""
     bag = make_bag(open_recording(drive_bag).frames[:FRAMES])
     frames = {frame.stamp_ns: frame for frame in open_recording(bag)}
     torch.set_num_threads(len(os.sched_getaffinity(0)))  # sums depend on it; nodes take all cores
     fused = open_detector(sensor_height=next(iter(frames.values())).sensor_height)
     expected = {stamp: fused(frame.load()).detections for stamp, frame in frames.items()}
-    monkeypatch.setattr(graph, "count_cores", lambda: 1)
     tracks = []
-    for name, arguments in ("one", []), ("many", ["--processes"]):
+    for name, arguments in ("one", ["--one-process"]), ("many", []):
         out = tmp_path / name
         outcome = CliRunner().invoke(demo, ["--data", str(bag), *arguments, "--out", str(out)])
         assert outcome.exit_code == 0, outcome.output

@@ -24,7 +24,6 @@ from lidar_perception.nodes.graph import (
     find_expert_range,
     list_awaited_topics,
     list_result_topics,
-    prefers_one_process,
     relative_name,
     reserve_domain,
 )
@@ -44,7 +43,7 @@ SILENCE_TIMEOUT_S = 10.0  # without a result after the last cloud
 
 def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = "candidates",
            rate: float = 1.0, single: bool = False, real_time: bool = False,
-           processes: bool | None = None) -> dict:
+           processes: bool = True) -> dict:
     """Replay a bag through the graph of a detector and record the results.
 
     The nodes run on a private ROS domain. Logs and the result bag are left in `out`.
@@ -59,8 +58,7 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         single: run the detector in one process.
         real_time: send clouds at the rate of the sensor. Otherwise a cloud is sent once the clouds
             before it have detections, so that none is lost on a slow machine.
-        processes: start one process for each node; False: one for all nodes of the graph; None: as
-            prefers_one_process() says.
+        processes: start one process for each node; False: one for all nodes of the graph.
 
     Returns:
         clouds, results (number of frames), latency_ms (median and p95 from sending a cloud to
@@ -96,7 +94,7 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         nodes["evaluator"] = configure_evaluator(scores.resolve(), single)
     recorded = [cloud_topic(single, detector), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
     nodes["bag_recorder"] = {}, {"bag": str((out / "result").resolve()), "topics": recorded}
-    one_process = prefers_one_process() if processes is None else not processes
+    one_process = not processes
     with (Processes(out / "logs", domain) as running,
           GraphMonitor(domain, stages[FINAL]) as monitor):
         with running.together(GRAPH) if one_process else nullcontext():
