@@ -62,7 +62,7 @@ def start(processes, how: str, node: str, *arguments: str) -> tuple[subprocess.P
 @pytest.mark.parametrize("how, node, stage, number", [
     ("ros2 run", "clustering", "blocked", signal.SIGINT),
     ("ros2 run", "perception", "numpy", signal.SIGTERM),
-    ("ros2 run", "fused_detector", "libtorch", signal.SIGINT),
+    ("ros2 run", "fused_detector", "configuring", signal.SIGINT),
     ("lidar-perception run", "tracker", "blocked", signal.SIGTERM),
     ("lidar-perception run", "evaluator", "ready", signal.SIGINT)])
 def test_node_stops_cleanly_at_any_stage(how, node, stage, number, processes):
@@ -72,7 +72,7 @@ def test_node_stops_cleanly_at_any_stage(how, node, stage, number, processes):
     if stage == "ready":
         assert all(map(blocks_signals, (proc / "task").iterdir()))
     segments = shared_segments(proc)
-    assert segments or stage not in ("libtorch", "ready")  # DDS is up by then
+    assert segments or stage not in ("configuring", "ready")  # DDS is up by then
     process.send_signal(number)
     assert process.wait(timeout=60) == 0
     assert not [path for path in segments if path.exists()] and "Traceback" not in log.read_text()

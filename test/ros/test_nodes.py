@@ -44,7 +44,7 @@ def test_every_node_ends_with_code_0(processes, peer, tmp_path, drive_bag):
     # Two seconds for each as a rule; where DDS hangs, stopping.py ends a node after 6.5.
     peer.spin_until(lambda: all(map(processes.has_ended, NODES)), 15.0)
     assert {n: p.returncode for n, p in processes.running.items()} == dict.fromkeys(NODES, 0)
-    logs = [*map(processes.log, NODES)]
+    logs = [*map(processes.read_log, NODES)]
     assert not any("Traceback" in log for log in logs)
     assert all("'input.queu', so it changes nothing; is 'input.queue' meant" in log for log in logs)
 
