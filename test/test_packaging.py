@@ -102,5 +102,7 @@ def test_wheel_ships_the_weights_of_the_default_detector_and_v4(metadata):
     package = ROOT / "lidar_perception"
     shipped = {path.name for pattern in metadata(URL)["package_data"]["lidar_perception"]
                for path in package.glob(pattern) if path.suffix == ".safetensors"}
-    assert shipped == {"judge.safetensors", "pointnet.safetensors",
-                       "pointpillars_v4_compact.safetensors", "pointpillars_v4_full.safetensors"}
+    assert shipped == {"judge.safetensors", "judge_no_intensity.safetensors",
+                       "pointnet.safetensors", "pointpillars_v4_compact.safetensors",
+                       "pointpillars_v4_compact_no_intensity.safetensors",
+                       "pointpillars_v4_full.safetensors"}

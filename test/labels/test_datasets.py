@@ -234,10 +234,10 @@ def test_boxes_are_transformed_to_the_frame_of_the_clouds(parts, tmp_path):
     if not parts:
         with pytest.raises(InputError, match="in 'odom', the clouds in 'lidar'"):
             bag_format.read(tmp_path / "bag", frames, "/n/output/detections")
-        assert not results.recorded(poses, stamps()).sources
+        assert not results.read_recorded_results(poses, stamps()).sources
         return
     labels = bag_format.read(tmp_path / "bag", frames, "/n/output/detections")
-    shown = results.recorded(poses, stamps())
+    shown = results.read_recorded_results(poses, stamps())
     for i, (frame, each) in enumerate(zip(frames, labels.frames)):
         near = transform_boxes(boxes, invert_pose(base_at(frame.stamp_ns) @ ON_BASE))
         np.testing.assert_allclose(each.boxes, near, atol=1e-3)
