@@ -36,10 +36,10 @@ def measure_simulation(streets: int, repeat: int) -> dict:
     total = sum(ms.values())
     rows = [make_row(f"({name})", ours_ms=ms[name]) for name in ms]
     rows.append(make_row("(one scan of a new street)", ours_ms=total, value=total, unit="ms",
-                    target=TARGET_MS))
+                         target=TARGET_MS))
     shared = total - ms["street"] * (1 - 1 / SHARED_SCANS)
     rows.append(make_row(f"(one of {SHARED_SCANS} scans of a street)", ours_ms=shared, value=shared,
-                    unit="ms"))
+                         unit="ms"))
     return make_measurement(title, len(scenes), np.median(points), rows,
                             solids=float(np.median(solids)))
 

@@ -41,7 +41,7 @@ def measure_startup(repeat: int, cold: tuple[str, ...] = ("fused", "clustering")
     runs = {name: np.median([_start(code) for _ in range(repeat)], axis=0)
             for name, code in CODE.items()}
     rows = [make_row(WITH_TORCH, peer_ms=1e3 * runs[WITH_TORCH][0], ours_ms=1e3 * runs["fused"][0],
-                value=runs[WITH_TORCH][0] / runs["fused"][0])]
+                     value=runs[WITH_TORCH][0] / runs["fused"][0])]
     rows += [make_row(f"{name}, peak memory", value=memory, unit="MB")
              for name, (_, memory) in runs.items()]
     for name in cold:

@@ -163,7 +163,7 @@ def room(name):
 
 
 @for_all([n for n in SOURCES if n.startswith("lidar_perception/")
-                                  and n != "lidar_perception/__init__.py"])
+          and n != "lidar_perception/__init__.py"])
 def test_no_arrow_points_up(name):
     """Imports inside functions count, and those for types."""
     below = ROOMS[:ROOMS.index(room(name.removesuffix(".py"))) + 1]
@@ -232,7 +232,7 @@ FORMATS = ("lidar_perception/classes.py", "lidar_perception/data/",  # whose wor
 
 
 @for_all([n for n in SOURCES if n.startswith("lidar_perception/")
-                                  and not n.startswith(FORMATS)])
+          and not n.startswith(FORMATS)])
 def test_a_class_is_named_in_one_table(name):
     from lidar_perception.classes import CLASSES
     written = {node.value for node in ast.walk(tree_of(name)) if isinstance(node, ast.Constant)

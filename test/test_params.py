@@ -153,7 +153,7 @@ def test_error_above_the_range_names_field_and_range(group, f):
 
 
 @for_all([p for p in bounded("low") + bounded("high")
-                                      if not p.values[1].metadata["item"]])
+          if not p.values[1].metadata["item"]])
 def test_range_includes_its_limits(group, f):
     for limit in (f.metadata["low"], f.metadata["high"]):
         if limit is not None:

@@ -59,7 +59,7 @@ def _print_precision(content: dict, console: Console) -> None:
                   end_section=True)
     for name, row in content["rows"].items():
         table.add_row(name, *(format_number(None if row["ap"][kind] is None else
-                                      row["ap"][kind][overlap]["moderate"])
+                                            row["ap"][kind][overlap]["moderate"])
                               for kind in SCORED for overlap in AP_ROWS))
     labels = {name: content["objects"][name]["moderate"] for name in SCORED}
     table.caption = "Labels: " + ", ".join(
@@ -72,9 +72,9 @@ def _print_precision(content: dict, console: Console) -> None:
 def _print_pedestrians(content: dict, console: Console) -> None:
     centres = content["pedestrians"]
     table = make_table(f"Pedestrians within 1.0 m ({centres['ground_truth']} in "
-                         f"{centres['frames']} frames), and time per frame", "",
-                         "score", "TP", "FP", "FN", "prec.", "recall", "F1", "best", "from", "ms",
-                         "runs", "failed", width=4)
+                       f"{centres['frames']} frames), and time per frame", "",
+                       "score", "TP", "FP", "FN", "prec.", "recall", "F1", "best", "from", "ms",
+                       "runs", "failed", width=4)
     for name, row in content["rows"].items():
         used, best = (row["pedestrian_centres"][key] for key in ("operating", "best"))
         table.add_row(
@@ -105,8 +105,8 @@ def _print_intervals(content: dict, console: Console) -> None:
         return
     shown = INTERVALS[0], INTERVALS[-1]
     table = make_table(f"{INTERVAL_PERCENT} % intervals, resampled by drive", "",
-                         *(f"{name[:3]} {SHORT[row]}" for name in SCORED for row in shown),
-                         "F1", width=7)
+                       *(f"{name[:3]} {SHORT[row]}" for name in SCORED for row in shown),
+                       "F1", width=7)
     table.add_row("overlap above", *(f"{(RELAXED if 'relaxed' in row else STRICT)[name]:g}"
                                      for name in SCORED for row in shown), style="dim",
                   end_section=True)

@@ -137,7 +137,7 @@ def _format_inline(cell: str | Cell) -> str:
 def to_csv(table: Table) -> str:
     """Return a table as CSV. A column of values becomes four: value, low, high and paper."""
     has_values = [any(isinstance(row[i], Cell) for row in table.rows)
-               for i in range(len(table.header))]
+                  for i in range(len(table.header))]
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow([name for i, title in enumerate(table.header) for name in (

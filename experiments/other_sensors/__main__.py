@@ -43,7 +43,7 @@ def main(data: Path, weights: str, min_score: float | None, kitti: Path | None) 
         total = {name: sum((counts for (_, own), counts in sums.items() if own == name), Counts())
                  for name in MAX_DISTANCE_M}
         click.echo("  all           " + "".join(f"{_cell(name, counts)} F1 {counts.f1:4.1f}"
-                                                 for name, counts in total.items()))
+                                                for name, counts in total.items()))
     if kitti is None:
         return
     for title, change in CHANGES.items():

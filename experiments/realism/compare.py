@@ -208,7 +208,7 @@ def compute_median_interval(values: np.ndarray) -> list[float]:
 
 
 def _make_row(n: int, median: float | None, low: float | None = None, high: float | None = None,
-         interval: list[float] | None = None) -> dict:
+              interval: list[float] | None = None) -> dict:
     return {"n": n, "median": median, "low": low, "high": high, "interval": interval}
 
 

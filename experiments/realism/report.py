@@ -44,7 +44,7 @@ def find_typical_factor(curve: dict) -> float | None:
 
 def _print_curves(content: dict, console: Console) -> None:
     table = make_table("Simulated against real, worst curves first",
-                   "curve", "within 20 %", "typical", "worst at", "ratio")
+                       "curve", "within 20 %", "typical", "worst at", "ratio")
     judged = [c for c in content["curves"].values() if c["judged"]]
     for curve in sorted(judged, key=lambda c: (c["share"], -(find_typical_factor(c) or 0.0))):
         worst = max((b for b in curve["bins"] if b["within"] is not None), key=compute_factor)
@@ -63,7 +63,7 @@ def _print_worst(content: dict, console: Console) -> None:
     bins = [(curve, b) for curve in content["curves"].values() for b in curve["bins"]
             if b["within"] is False]
     table = make_table(f"The {min(WORST, len(bins))} worst bins of {len(bins)} not within 20 %",
-                   "curve", "bin", "real", "10..90 %", "n", "sim.", "10..90 %", "n", "ratio")
+                       "curve", "bin", "real", "10..90 %", "n", "sim.", "10..90 %", "n", "ratio")
     for curve, b in sorted(bins, key=lambda item: -compute_factor(item[1]))[:WORST]:
         table.add_row(_format_title(curve), b["bin"],
                       *(cell for side in ("real", "simulated") for cell in _format_cells(b[side])),

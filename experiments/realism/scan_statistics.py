@@ -95,7 +95,7 @@ CURVES = {
            ("height", "height seen / box"), ("length", "length seen / box"),
            ("width", "width seen / box"), ("above", "points above 0.65 of the height"))},
     **{CAR_FROM + face: Curve(f"{CAR_FROM}{face}: depth of the points in the box [m]",
-                          tuple(f"{q}%" for q in FACE_QUANTILES), "quantile", step=FACE_STEP)
+                              tuple(f"{q}%" for q in FACE_QUANTILES), "quantile", step=FACE_STEP)
        for face in FACES},
     **{f"{stage} {score}": Curve(f"paper A, {stage}: {score}", (*RANGE_NAMES, "all"))
        for stage in STAGES for score in SCORES},

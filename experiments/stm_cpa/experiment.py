@@ -107,7 +107,7 @@ def search_clustering(segmented: SegmentedCloud, seed: Seed | None,
 
 
 def _find_clusters(segmented: SegmentedCloud, plane: np.ndarray | None, seed: Seed, eps: float,
-              min_samples: int) -> np.ndarray:
+                   min_samples: int) -> np.ndarray:
     bands = len(PAPER.clustering.dbscan.eps)
     params = with_values(PAPER, {"clustering.dbscan.eps": (eps,) * bands,
                                  "clustering.dbscan.min_samples": min_samples})

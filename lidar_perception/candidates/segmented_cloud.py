@@ -51,7 +51,7 @@ def fit_ground_plane(ground: np.ndarray, params: BoxParams) -> np.ndarray | None
 
 
 def diagnose_empty(usable: int, ground: np.ndarray,
-                    cluster_ids: np.ndarray | None = None) -> str | None:
+                   cluster_ids: np.ndarray | None = None) -> str | None:
     """Explain why a cloud has no candidates, with the remedy; None if there is no reason so far.
 
     usable is the number of finite points; ground (M,) and cluster_ids (M,) are those of the points

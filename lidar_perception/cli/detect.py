@@ -131,9 +131,9 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
     open_ = partial(detector.open, sensor_height=height, min_score=min_score)
     opened_detector = open_()
     header = make_header(recording, detector.weights, opened_detector,
-                       tracking=tracking if track else None,
-                       ego=choose_ego_source(recording, ego) if track else None,
-                       split=None if split is None else str(split), device=detector.device)
+                         tracking=tracking if track else None,
+                         ego=choose_ego_source(recording, ego) if track else None,
+                         split=None if split is None else str(split), device=detector.device)
     if track and min_score is None:  # the tracker is given weak ones too
         open_ = partial(detector.open, sensor_height=height, min_score=tracking.min_score)
         opened_detector = open_()

@@ -12,7 +12,7 @@ from lidar_perception.nodes import NODES
 
 
 @click.command(cls=Command, context_settings=dict(ignore_unknown_options=True,
-                                                   allow_interspersed_args=False))
+                                                  allow_interspersed_args=False))
 @click.argument("node", type=Choice(NODES), metavar="NODE")
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
 def run_node(node: str, arguments: tuple[str, ...]) -> None:

@@ -38,7 +38,7 @@ def distance_aware_dbscan(xyz: np.ndarray, params: DbscanParams = DbscanParams()
     last = 0
     # The compiled code releases the GIL, so each band runs in its own thread.
     found = _thread_pool().map(lambda members, eps: dbscan(xyz.take(members, axis=0), eps,
-                                                       params.min_samples), bands, params.eps)
+                                                           params.min_samples), bands, params.eps)
     for members, ids in zip(bands, found):
         labels[members] = np.where(ids > 0, ids + last, 0)
         last += int(ids.max(initial=0))
@@ -69,7 +69,7 @@ def _sort_by_band(xyz, limits):
 
 
 def _join_bands(xyz: np.ndarray, bands: list[np.ndarray], labels: np.ndarray,
-            eps: tuple[float, ...]) -> np.ndarray:
+                eps: tuple[float, ...]) -> np.ndarray:
     """Return labels (N,) with clusters joined across neighbouring bands and renumbered in order.
 
     bands holds the indices of each band's points.

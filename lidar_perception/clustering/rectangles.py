@@ -181,7 +181,7 @@ def _find_closest_direction(x, y, hull):
         side_u = high_u if 2 * (cos * mean_x + sin * mean_y) > low_u + high_u else low_u
         side_v = high_v if 2 * (cos * mean_y - sin * mean_x) > low_v + high_v else low_v
         closeness = _compute_closeness(x, y, np.float32(cos), np.float32(sin), np.float32(side_u),
-                               np.float32(side_v))
+                                       np.float32(side_v))
         if closeness > best:
             best, best_cos, best_sin = closeness, cos, sin
     return best_cos, best_sin

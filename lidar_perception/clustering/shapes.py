@@ -17,7 +17,7 @@ from lidar_perception.groups import count_clusters
 
 @njit(cache=True, nogil=True)
 def find_extents(xyz: np.ndarray, labels: np.ndarray,
-            count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+                 count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return low (K, 3), high (K, 3) float32 and sizes (K,) int64 of clusters 1..K = count.
 
     A cluster without points has low = inf, high = -inf.

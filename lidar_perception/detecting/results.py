@@ -119,8 +119,8 @@ def with_optional_parts(frame: Frame, report: Callable[[str], None]) -> Frame:
 
 
 def start_writing(record_of: Callable[[str], Mapping[str, Any]], min_scores: Mapping[str, float],
-              tracker: Callable[[Recording], DriveTracker] | None,
-              report: Callable[[str], None], scans: bool = False) -> Start:
+                  tracker: Callable[[Recording], DriveTracker] | None,
+                  report: Callable[[str], None], scans: bool = False) -> Start:
     """Return a Start that makes the FrameResult of every frame from its record.
 
     Frames must be processed in order of time, in one process.
@@ -137,9 +137,9 @@ def start_writing(record_of: Callable[[str], Mapping[str, Any]], min_scores: Map
 
 
 def _start_writing(record_of: Callable[[str], Mapping[str, Any]], min_scores: Mapping[str, float],
-               tracker_of: Callable[[Recording], DriveTracker] | None,
-               report: Callable[[str], None], scans: bool,
-               recording: Recording) -> Callable[[Frame], FrameResult]:
+                   tracker_of: Callable[[Recording], DriveTracker] | None,
+                   report: Callable[[str], None], scans: bool,
+                   recording: Recording) -> Callable[[Frame], FrameResult]:
     thresholds = np.array([min_scores.get(name, 0.0) for name in CLASSES], np.float32)
     tracker = None if tracker_of is None else tracker_of(recording)
     trails = Trails()

@@ -30,7 +30,7 @@ from lidar_perception.types import CLASSES
 
 # Output files of a run, without the journal and the bag, which is replaced as a whole.
 OUTPUT_PATTERNS = ("kitti/**/*.txt", "detections.json", "detections.csv", "openlabel/*.json",
-           "png/**/*.png")
+                   "png/**/*.png")
 
 
 @dataclass
@@ -79,8 +79,8 @@ class Summary:
 
 
 def make_header(recording: Recording, weights: str, detector: ConfigurableDetector, *,
-              tracking: TrackingParams | None = None, ego: str | None = None,
-              **more: Any) -> dict[str, Any]:
+                tracking: TrackingParams | None = None, ego: str | None = None,
+                **more: Any) -> dict[str, Any]:
     """Return a JSON object with everything that determines the results of a run.
 
     Two runs with the same header have the same results.

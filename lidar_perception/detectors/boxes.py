@@ -49,7 +49,7 @@ def move_to_ground(boxes: np.ndarray, ground_heights: np.ndarray, share: float) 
 
 
 def move_cars_to_points(boxes: np.ndarray, class_ids: np.ndarray, xyz: np.ndarray,
-                   share: float) -> np.ndarray:
+                        share: float) -> np.ndarray:
     """Return boxes (K, 7) float64 with the cars moved by move_to_points."""
     moved, cars = np.array(boxes, np.float64), class_ids == CAR
     if share and cars.any():

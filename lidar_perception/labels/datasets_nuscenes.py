@@ -109,7 +109,7 @@ class NuscenesTables:
         write_bytes(path, sweep.tobytes())
 
     def _add_boxes(self, scene: str, sample: str, labels: FrameLabels, pose: np.ndarray,
-               cloud: np.ndarray) -> None:
+                   cloud: np.ndarray) -> None:
         inside = np.diff(points_in_boxes(cloud, labels.boxes)[1]) if len(labels) else ()
         placements = format_boxes(sample, *to_global_boxes(labels.boxes, pose))
         for k, placement in enumerate(placements):

@@ -205,11 +205,11 @@ def _draw_trails(canvas: Canvas, view: View, found: Boxes, tints: np.ndarray) ->
         colors.append(np.tile(tint, (len(low) - 1, 1)))
         alphas.append(np.linspace(0.1, 0.9, len(low) - 1))
     canvas.draw_lines(project_lines(view, np.concatenate(lines)), np.concatenate(colors), 2.5,
-                 np.concatenate(alphas))
+                      np.concatenate(alphas))
 
 
 def _draw_edges(canvas: Canvas, view: View, boxes: np.ndarray, colors: np.ndarray, width: float,
-           dashed: bool = False) -> None:
+                dashed: bool = False) -> None:
     """Draw the edges of boxes (K, 7) in colors (K, 3). In the bird's-eye view: the bottom edges,
     and a line from the centre to the front."""
     corners = box_corners(boxes)
@@ -257,7 +257,7 @@ def _make_heading(stage: Stage, title: str, time: str) -> list[Text]:
 
 
 def _draw_legend(canvas: Canvas, stage: Stage, found: Boxes, labels: np.ndarray,
-            scale: bool) -> list[Text]:
+                 scale: bool) -> list[Text]:
     """Draw the colours of classes with their numbers of boxes, the line of labels, and the colour
     scale of the points; return the texts."""
     items, x, y = [], 18.0, stage.height - 20.0

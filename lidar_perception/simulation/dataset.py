@@ -47,7 +47,7 @@ class DatasetPlan:
         self.scenes.scene_types()
         for wrong, what in (
                 (self.layout not in ("mcap", *LAYOUTS), f"layout = {self.layout!r} must be one of "
-                                             f"{', '.join(LAYOUTS)}"),
+                 f"{', '.join(LAYOUTS)}"),
                 (self.frames < 1, f"frames = {self.frames} must be at least 1"),
                 (self.seed < 0, f"seed = {self.seed} must not be negative"),
                 (not 1 <= self.streets_of <= most,
@@ -87,7 +87,7 @@ def _write_semantickitti(folder: Path, plan: DatasetPlan, sequence: int, moment:
     digits = max(2, len(str((plan.frames - 1) // plan.streets_of)))
     name = f"sequences/{sequence:0{digits}}"
     semantickitti.write_scan(folder / name, moment, cloud, scan.semantic[order],
-                                   scan.instance[order])
+                             scan.instance[order])
     shares = {f"{name}/poses.txt": semantickitti.format_pose(scan.pose, FORWARD_CAMERA),
               f"{name}/times.txt": f"{moment / plan.sensor.rate:.6e}\n"}
     if moment == 0:

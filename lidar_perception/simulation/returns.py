@@ -45,7 +45,7 @@ class Returns(NamedTuple):
 
 
 def make_returns(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Generator,
-            compensated: bool = True) -> Returns:
+                 compensated: bool = True) -> Returns:
     """Return the points that the sensor reports.
 
     A return is lost if its power, which is proportional to brightness over range squared, is below

@@ -75,7 +75,7 @@ def update(means: np.ndarray, covariances: np.ndarray, measured: np.ndarray,
     spread[:, range(3), range(3)] += noise * noise
     gain = np.linalg.solve(spread, against.transpose(0, 2, 1)).transpose(0, 2, 1)
     return _normalize(means + (gain @ innovation[:, :, None])[:, :, 0],
-                  covariances - gain @ against.transpose(0, 2, 1))
+                      covariances - gain @ against.transpose(0, 2, 1))
 
 
 def constrain_to_heading(means: np.ndarray, covariances: np.ndarray,
@@ -93,7 +93,7 @@ def constrain_to_heading(means: np.ndarray, covariances: np.ndarray,
     gain = against / spread[:, None]
     across = cos * vy - sin * vx
     return _normalize(means - gain * across[:, None],
-                  covariances - gain[:, :, None] * against[:, None, :])
+                      covariances - gain[:, :, None] * against[:, None, :])
 
 
 def flip_reversed_headings(means: np.ndarray, agreement: np.ndarray,

@@ -168,9 +168,9 @@ class Tracker:
         boxes, scores = detections.boxes.astype(np.float64), detections.scores.astype(np.float64)
         with np.errstate(invalid="ignore"):
             valid = (np.isfinite(boxes).all(axis=1) & np.isfinite(scores)
-                    & (boxes[:, 3:6] > 0).all(axis=1)
-                    & (np.abs(boxes[:, :6]) <= MAX_RANGE).all(axis=1)
-                    & (detections.class_ids >= 0) & (detections.class_ids < len(CLASSES)))
+                     & (boxes[:, 3:6] > 0).all(axis=1)
+                     & (np.abs(boxes[:, :6]) <= MAX_RANGE).all(axis=1)
+                     & (detections.class_ids >= 0) & (detections.class_ids < len(CLASSES)))
         if not valid.all():
             self.problem = (f"{(~valid).sum()} of {len(valid)} detections are ignored: not finite, "
                             f"without a size, or more than {MAX_RANGE / 1e3:g} km from the origin "

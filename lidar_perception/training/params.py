@@ -40,7 +40,7 @@ class LoopParams(Params):
     save_steps: int = param(200, "Steps between checkpoints for resuming.", low=1, high=10**9)
     log_steps: int = param(10, "Steps between logged losses.", low=1, high=10**6)
     max_skipped: int = param(50, "Give up after this many consecutive steps whose loss or "
-                              "gradient is not finite.", low=1, high=10**6)
+                             "gradient is not finite.", low=1, high=10**6)
     seed: int = param(0, "Seed of the weights, the order of the scenes and their augmentation.",
                       low=0, high=2**31 - 1)
 
@@ -152,7 +152,7 @@ class DataParams(Params):
                              "drives are held out whole, or the end of one.", low=0.0, high=0.9)
     view: bool = param(True, "Use only the points in KITTI's image, since its labels end there.")
     min_points: int = param(5, "Objects and clusters with fewer points are left out of the "
-                              "loss.", low=1, high=1000)
+                            "loss.", low=1, high=1000)
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ FullScale = Callable[[np.ndarray, DTypeLike], float]  # see intensity.full_scale
 
 
 def to_point_cloud(msg: Any, intensity_max: float | None = None,
-             scale: FullScale = infer_full_scale) -> tuple[PointCloud, np.ndarray]:
+                   scale: FullScale = infer_full_scale) -> tuple[PointCloud, np.ndarray]:
     """Convert a PointCloud2 to a PointCloud of its usable points.
 
     If the cloud has a column `in_view`, points where it is 0 are left out.

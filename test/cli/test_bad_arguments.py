@@ -136,7 +136,7 @@ def test_a_command_that_cannot_be_used_is_exit_code_2(arguments, words, monkeypa
     ("fussed", ["pointnet", "fused"], "fused"), ("fused", ["tracker", "fused_detector"],
                                                  "fused_detector"),
     ("vlp99", ["hdl-64e", "vlp-16", "vlp-32c"], "vlp-16"), ("KITTI_traking", ["kitti-tracking"],
-                                                           "kitti-tracking"),
+                                                            "kitti-tracking"),
     ("luck", ["seeds", "points"], None), ("", ["a"], None), (None, ["x"], None)])
 def test_the_closest_name_is_found_where_there_is_one(name, known, closest):
     assert closest_name(name, known) == closest

@@ -65,7 +65,7 @@ def test_a_config_says_the_same_as_set_and_set_wins(bag, tmp_path):
     ("5: 6", "5 is no name of a parameter"), ("{stm: {on: 1}}", "True is no name of a parameter"),
     ("[" * 700, "cannot read the parameter file"), ("a: 2001-99-99", "cannot read the param"),
     ("\n    ".join(["a0: &a0 {x: 1}"] + [f"a{i + 1}: &a{i + 1} {{x: *a{i}, y: *a{i}}}"
-                                        for i in range(40)]), "more than 10000 parameters"),
+                                         for i in range(40)]), "more than 10000 parameters"),
     ("\n    ".join(["a0: &a0 {}"] + [f"a{i + 1}: &a{i + 1} {{x: *a{i}, y: *a{i}}}"
                                      for i in range(40)]), "more than 10000 parameters"),
     ("&a {b: *a}", "more than 20 others")], ids=range(9))

@@ -120,7 +120,7 @@ def test_points_with_different_radii_cluster_as_if_separate():
     params = EuclideanParams(gamma=0.0, beta=0.0, min_size=3)
     near, far = (rng.uniform(-6, 6, (600, 3)).astype(np.float32) + [x, 0, 0] for x in (0, 500))
     together = cluster_euclidean(np.concatenate([near, far]), params,
-                         radii=np.repeat([0.5, 1.2], 600))
+                                 radii=np.repeat([0.5, 1.2], 600))
     one, other = (cluster_euclidean(xyz.astype(np.float32), replace(params, radius=radius))
                   for xyz, radius in ((near, 0.5), (far, 1.2)))
     assert one.max() > 3 and other.max() > 3

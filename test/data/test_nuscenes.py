@@ -133,7 +133,7 @@ def test_global_transform_is_invertible(seed, yaw, pitch, roll):
     corners = box_corners(boxes)
     for box, centre, rotation, own in zip(boxes, moved.centres, moved.rotations, corners):
         signs = np.array([[x, y, z] for z in (-1, 1) for x, y in ((1, 1), (-1, 1), (-1, -1),
-                                                                   (1, -1))]) / 2
+                                                                  (1, -1))]) / 2
         expected = Rotation.from_quat(np.roll(rotation, -1)).apply(signs * box[3:6]) + centre
         np.testing.assert_allclose(own @ pose[:3, :3].T + pose[:3, 3], expected, atol=1e-8)
 

@@ -126,7 +126,7 @@ def seen_by_view(path):
     """A bag as `view` opens it: the recording and its results."""
     recording = open_recording(path, points=choose_points_topic(path))
     return recording, read_recorded_results(recording.frames.poses,
-                               [frame.stamp_ns for frame in recording.frames[:]])
+                                            [frame.stamp_ns for frame in recording.frames[:]])
 
 
 @pytest.mark.parametrize("clouds", [True, False])
@@ -151,7 +151,7 @@ def test_a_bag_holds_what_the_nodes_publish(drives, tmp_path, monkeypatch, cloud
 
 
 def test_bag_with_duplicate_stamps_is_written_without_labels(tmp_path, monkeypatch,
-                                                                              capsys):
+                                                             capsys):
     """Nothing would say whose the labels are."""
     frames = [replace(frame, stamp_ns=STAMP) for frame in scans(3)]
     recording = Recording(tmp_path, "", frames)
@@ -281,7 +281,7 @@ def test_the_number_of_processes_does_not_change_the_result(drives, tmp_path):
 
 
 def test_other_run_in_folder_is_refused_without_force(kitti, tmp_path, monkeypatch, capsys,
-                                                         made):
+                                                      made):
     out = tmp_path / "out"
     assert detect(monkeypatch, kitti, "--out", out, "--format", "kitti,csv", "--limit", 2) == 0
     assert detect(monkeypatch, kitti, "--out", out) == 0  # more frames, another format
@@ -301,7 +301,7 @@ def test_other_run_in_folder_is_refused_without_force(kitti, tmp_path, monkeypat
 
 
 def test_unreadable_frames_are_named_and_others_written(kitti, tmp_path,
-                                                                         monkeypatch, capsys, made):
+                                                        monkeypatch, capsys, made):
     cut, out = kitti / "training/velodyne/000001.bin", tmp_path / "out"
     whole = cut.read_bytes()
     write(cut, b"123")
@@ -318,7 +318,7 @@ def test_unreadable_frames_are_named_and_others_written(kitti, tmp_path,
 
 
 def test_unreadable_labels_and_cameras_are_optional(kitti, tmp_path, monkeypatch,
-                                                                capsys):
+                                                    capsys):
     write(kitti / "training/label_2/000001.txt", "Car")
     for i in 0, 2, 3:
         (kitti / f"training/calib/{i:06}.txt").unlink()
@@ -379,7 +379,7 @@ def test_pictures_and_a_film_of_every_frame(drives, tmp_path, monkeypatch, made)
 
 
 def test_impossible_video_is_refused_before_any_work(drives, tmp_path, monkeypatch,
-                                                               capsys, made):
+                                                     capsys, made):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec",
                         lambda name, *more: None if name == "av" else find(name, *more))

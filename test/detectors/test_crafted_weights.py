@@ -70,7 +70,7 @@ SMALL = {
     "pointpillars": (lambda: Header(tiny("v4"), {"steps": 1}, {"map": 0.5}, "abc"), lively,
                      load_detector, eager()),
     "pointnet": (lambda: Header(make_pointnet_config(points=16, centroids=8, coarse=4,
-                                                neighbours=(4, 4, 4), coarse_neighbours=4)),
+                                                     neighbours=(4, 4, 4), coarse_neighbours=4)),
                  make_pointnet, load_pointnet_detector,
                  with_values(PointNetDetectorParams(), {"pointnet.warm_up": False})),
 }

@@ -81,7 +81,7 @@ def copy_labels(frame, score=0.9) -> Detections:
 
 
 def test_all_detectors_run_and_missing_ones_are_listed(bare, weights, tmp_path,
-                                                                 monkeypatch):
+                                                       monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     root, png = crowd_folder(tmp_path / "kitti", 3), tmp_path / "pictures/compare.png"
     given = [word for name in "acb" for word in ("--weights", weights / name)]

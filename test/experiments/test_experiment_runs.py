@@ -151,7 +151,7 @@ def test_skipped_frame_is_tried_again(few, tmp_path):
     assert "000001.bin" in first[1]["skipped"] and "000001.bin" in first[2]["skipped"]
     scan.write_bytes(whole)
     resumed, fresh = (run_experiment(SMALL, open_recording(few), tmp_path / name)
-                     for name in ("out", "again"))
+                      for name in ("out", "again"))
     assert resumed == fresh
 
 
@@ -341,7 +341,7 @@ def test_every_format_has_every_table_and_figure(whole):
         assert picture.read_bytes().startswith(b"\x89PNG")
         assert figure["title"] in page and f"(figures/{figure['name']}.png)" in markdown
     assert {p for p in whole.rglob("*") if p.is_file()} == {whole / journal.JOURNAL_NAME,
-                                                             *report_files.list_report_files(whole)}
+                                                            *report_files.list_report_files(whole)}
 
 
 def test_page_is_self_contained_and_describes_the_run(whole, crowds):

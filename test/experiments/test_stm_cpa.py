@@ -231,7 +231,7 @@ def test_overlaps_of_known_boxes():
     (lambda label: label + "Car 0.00 0 0.00 0.00 0.00 0.00 0.00 9.00 90.00 90.00 0.00 3.00 20.00 "
      "0.00\n", "stands in a labelled Car")])
 def test_bad_seed_gives_misses_and_reason(kitti, tmp_path, change,
-                                                                        words):
+                                          words):
     shutil.copytree(kitti, tmp_path / "kitti")
     label = tmp_path / "kitti/training/label_2/000002.txt"
     label.write_text(change(label.read_text()))

@@ -91,7 +91,7 @@ def test_only_moved_boxes_get_new_columns(tmp_path):
     assert (name, float(truncated), occluded) == ("Car", 0.0, "1")  # occlusion is kept
     assert rest[:3] == ["1.50", "1.60", "3.90"] and float(rest[5]) == pytest.approx(31, abs=0.02)
     assert float(alpha) == pytest.approx(float(rest[6]) - np.arctan2(float(rest[3]),
-                                                                      float(rest[5])), abs=1e-5)
+                                                                     float(rest[5])), abs=1e-5)
     assert 600 < float(left) < float(right) < 700 and 150 < float(top) < float(bottom) < 250
 
 

@@ -86,7 +86,7 @@ def test_canvas_skips_invalid_and_outside_shapes():
 
 def test_polygon_covers_its_inside():
     for corners in np.array([[2, 3], [12, 3], [12, 9], [2, 9]]), np.array([[2, 9], [12, 9], [12, 3],
-                                                                         [2, 3]]):
+                                                                           [2, 3]]):
         canvas = Canvas(*SIZE)
         canvas.fill_polygon(corners, GREEN, 0.5)
         assert (canvas.pixels[3:9, 2:12, 1] == 128).all()

@@ -123,7 +123,7 @@ def test_layout_does_not_change_the_result(serve, good_cloud):
     organised.height, organised.width = 8, 10_000
     organised.row_step = organised.width * organised.point_step
     clouds = [serve("ground_segmentation", msg) for msg in (cloud(xyz, 101), big_endian(xyz, 102),
-                                                           organised)]
+                                                            organised)]
     plain, big, grid = (to_array(msg)["ground"] for msg in clouds)
     assert plain.sum() > 1000
     np.testing.assert_array_equal(plain, big)

@@ -100,7 +100,7 @@ def test_first_cloud_waits_for_odometry_of_its_whole_turn(start):
 
 @pytest.mark.parametrize("first, begin, sectors", [(0.3, 0.0, ()), (1.0, -1.0, (120.0, 240.0))])
 def test_later_clouds_wait_for_the_end_of_their_turn(start, first, begin,
-                                                                                sectors):
+                                                     sectors):
     """A part of a turn, where the driver starts in the middle of one; or one that is stamped at its
     end, near which points are cropped. The odometry comes every 0.02 s."""
     node = start(GroundSegmentation, **{"input.deskew": "odometry", "crop.sectors": sectors})

@@ -34,7 +34,7 @@ RUNS = {  # (single, processes, parameters in addition to PAPER)
     "three nodes of paper C": (False, True, PAPER_C),
     "the same in one process": (False, False, PAPER_C),
     "one node, patchwork": (True, True, {"ground.method": "patchwork", "boxes.shape": "min_area",
-                                   "clustering.dbscan.join_bands": True}),
+                                         "clustering.dbscan.join_bands": True}),
 }
 
 

@@ -165,7 +165,7 @@ def test_bad_parameter_files_are_refused_in_one_line(processes):
 
 
 def test_missing_template_is_reported_with_first_cloud(perception, shared_peer,
-                                                                        talker, good_cloud):
+                                                       talker, good_cloud):
     """A diagnostic, as the file may appear."""
     peer = shared_peer
     with peer.parameters("/perception", {"seed.file": "/nowhere.json"}):

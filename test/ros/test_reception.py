@@ -321,7 +321,7 @@ class Late:
             self.now = tick / 100
             if tick % 10 == 0:
                 self.reception._on_message(self.now, {"publication_sequence_number": tick // 10,
-                                                    "source_timestamp": tick * 10**7})
+                                                      "source_timestamp": tick * 10**7})
             self.reception.retry()
             while self.todo:
                 self.todo.pop(0)()

@@ -223,7 +223,7 @@ def test_detection_arrays_are_tracked_as_markers_are(start):
     """By the node in this process, as vision_msgs is not everywhere."""
     node, tracker = start(TrackerNode), Tracker()
     node.transforms.on_odometry(make_odometry(pose(50, 0, 1), header(START, "lidar"), "base",
-                                               bag_message))  # detections are in its fixed frame
+                                              bag_message))  # detections are in its fixed frame
     for i, found in enumerate(crowd()):
         stamp = START + i * TENTH
         node.on_detections(to_detection_array(

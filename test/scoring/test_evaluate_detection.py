@@ -226,7 +226,7 @@ def test_frames_without_labels_are_written_and_not_scored(kitti, detector, tmp_p
 
 
 def test_truncated_scan_is_skipped_and_rejected_scan_missed(kitti, detector,
-                                                                         tmp_path):
+                                                            tmp_path):
     write(kitti / "training/velodyne/000001.bin", b"123")
     content, text = evaluate(tmp_path, "--data", kitti, "--weights", "w")
     line, = content["skipped"]

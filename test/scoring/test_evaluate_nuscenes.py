@@ -210,7 +210,7 @@ def test_scene_files_that_are_wrong_are_named(root, tmp_path, monkeypatch, capsy
 @pytest.mark.parametrize("made, config", [(detection_samples, detection_samples.tiny()),
                                           (pointnet_samples, pointnet_samples.small())])
 def test_detector_gets_the_sensor_height(made, config, tmp_path,
-                                                                      one_thread):
+                                         one_thread):
     save_checkpoint(tmp_path / "w", made.lively(config), Header(config))
     detector = open_detector(tmp_path / "w", "cpu", sensor_height=1.84)
     assert detector.networks[0].config == config

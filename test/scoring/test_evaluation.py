@@ -151,7 +151,7 @@ def test_hits_misses_and_false_positives_add_up(seed, frames):
 def test_a_case_by_hand():
     score = Score()
     score.update(boxes([10.3, 0, 0], [20, 0, 0.5], [14.5, 14.5, 0], [61, 0, 0]),
-              boxes([10, 0, 0], [20, 0, 0], [40, 0, 0]))
+                 boxes([10, 0, 0], [20, 0, 0], [40, 0, 0]))
     score.update(np.zeros((0, 7), np.float32), boxes([5, 0, 0]))
     score.update(boxes([0, -50, 0]).astype(np.float32), np.zeros((0, 7)))
     table = score.table()

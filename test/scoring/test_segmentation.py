@@ -351,7 +351,7 @@ def test_command_scores_every_method_and_skips_broken_scan(tmp_path):
     for reports in content["clusters"].values():
         assert list(reports) == list(CLUSTERING_METHODS)
     cars, walkers = (content["clusters"][s]["dbscan"] for s in ("SemanticKITTI",
-                                                                    "KITTI object data"))
+                                                                "KITTI object data"))
     assert (cars["objects"], cars["hits"], cars["precision"]) == (4, 4, 1)
     assert (walkers["objects"], walkers["frames"]) == (2, 2)
 

@@ -138,7 +138,7 @@ def test_lines_of_non_repeating_pattern_are_not_beams():
         xyz = np.column_stack([away * np.cos(aside), away * np.sin(aside),
                                2 - 0.02 * away + rng.normal(0, 0.01, len(away))])
         changed.append(scan._replace(xyz=xyz, ground_range=away, ring=np.arange(len(away)) % 4,
-                                   elevation=np.degrees(np.arctan2(xyz[:, 2], away))))
+                                     elevation=np.degrees(np.arctan2(xyz[:, 2], away))))
     assert find_beams(changed) is None
 
 

@@ -135,9 +135,9 @@ def test_contradictions_of_tf_and_clouds_are_reported():
     unposed = replace(right, mounting=right.mounting._replace(recorded=recorded))
     assert any("from clouds alone: 3 of 4 clouds" in line for line in find_warnings(unposed))
     for tf_mount, height, words in ((make_mount(0, roll + 3, pitch), None, "with roll"),
-                                (make_mount(0, roll, pitch - 3), None, "and pitch"),
-                                (make_mount(45, roll, pitch), None, "correct the yaw"),
-                                (true, mount.height + 0.4, "above the ground")):
+                                    (make_mount(0, roll, pitch - 3), None, "and pitch"),
+                                    (make_mount(45, roll, pitch), None, "correct the yaw"),
+                                    (true, mount.height + 0.4, "above the ground")):
         wrong = measure_drive(record(poses, true, tf_mount, height))
         assert sum("URDF" in line and words in line for line in find_warnings(wrong)) == 1
         row = next(value for value in list_values(wrong) if value.name == "mount by TF")

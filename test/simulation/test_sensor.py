@@ -37,7 +37,7 @@ def hits(sensor, distance, brightness=0.3, cosine=1.0):
 
 def measured(sensor, distance, brightness=0.3, motion=NO_MOTION, seed=0, cosine=1.0, **flags):
     return make_returns(hits(sensor, distance, brightness, cosine), sensor, motion,
-                   np.random.default_rng(seed), **flags)
+                        np.random.default_rng(seed), **flags)
 
 
 @pytest.mark.parametrize("name", SENSOR_NAMES)

@@ -51,7 +51,7 @@ def test_data_set_records_its_settings(made):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_failed_data_set_is_marked_and_resumed(made, tmp_path, monkeypatch,
-                                                                     layout):
+                                               layout):
     out, calls = tmp_path / "set", itertools.count()
 
     def fails(*args):

@@ -30,7 +30,7 @@ def livox_message(points: dict[str, np.ndarray], package: str = "livox_ros_drive
                   stamp_ns: int = STAMP, frame_id: str = "livox_frame"):
     """CustomMsg of rosbags' class."""
     rows = [bag_message(f"{package}/msg/CustomPoint", **dict(zip(points, map(lambda v: v.item(),
-                                                                            row))))
+                                                                             row))))
             for row in zip(*points.values())]
     return bag_message(f"{package}/msg/CustomMsg", header=header(bag_message, stamp_ns, frame_id),
                        timebase=stamp_ns, point_num=len(rows), lidar_id=1, points=rows)

@@ -48,7 +48,7 @@ def test_source_options_are_the_known_sources():
 
 @pytest.mark.parametrize("installed", [True, False])
 def test_recorded_poses_come_before_kiss_icp(monkeypatch,
-                                                                                   installed):
+                                             installed):
     monkeypatch.setattr(ego, "has_odometry", lambda: installed)
     assert choose_recorded_source(True) == "recording"
     assert choose_recorded_source(False) == ("kiss_icp" if installed else NO_SOURCE)

@@ -120,7 +120,7 @@ def test_occluded_track_lasts_equally_long_at_any_rate(rate):
         frames = [cars(car(10))] * (4 * rate) + [Detections.none()] * int(hidden * rate)
         tracker = Tracker()
         track([*frames, cars(car(10))], tracker=tracker,
-                 stamps=[START + i * 10**9 // rate for i in range(len(frames) + 1)])
+              stamps=[START + i * 10**9 // rate for i in range(len(frames) + 1)])
         return tracker.started
     assert (started(1.4), started(2.0)) == (1, 2)
 
@@ -131,7 +131,7 @@ def test_weak_detections_continue_but_never_start_tracks():
     track([cars(car(10), scores=weak)] * 10, tracker=tracker)
     assert (tracker.started, tracker.alive) == (0, 0)
     tracks = track([cars(car(10))] * 10 + [cars(car(10), scores=weak)] * 3, tracker=tracker,
-                      stamps=[START + (20 + i) * TENTH for i in range(13)])
+                   stamps=[START + (20 + i) * TENTH for i in range(13)])
     assert tracks[-1].ids.tolist() == [1] and tracks[-1].seen[0]
 
 
@@ -164,7 +164,7 @@ def test_slow_object_heading_follows_majority_of_scores(at, speed):
     flipped = np.random.default_rng(0).random(60) < 0.25
     flipped[:3] = True
     tracks = track([cars(car(10 + 0.1 * speed * i, yaw=np.pi * wrong))
-                       for i, wrong in enumerate(flipped)], [at] * 60)
+                    for i, wrong in enumerate(flipped)], [at] * 60)
     headings = wrap_angle(np.array([t.detections.boxes[0, 6] for t in tracks]))
     assert np.abs(np.abs(headings[:3]) - np.pi).max() < 0.01
     assert np.abs(headings[15:]).max() < 0.01 and {t.ids.tolist()[0] for t in tracks} == {1}

@@ -75,7 +75,7 @@ def test_bag_of_folder_has_same_scenes(tmp_path):
 
 def test_scenes_without_camera_are_labelled_all_around(tmp_path):
     frames = [Frame.of("0", PointCloud(two_objects()[:, :3].copy()), GroundTruth.of([WALKER],
-                                                                                   [PEDESTRIAN]))]
+                                                                                    [PEDESTRIAN]))]
     write_bag(tmp_path / "bag", frames)
     scene = open_labelled_frames(tmp_path / "bag").to_scenes().scene(0)
     assert scene.around and np.array_equal(scene.points[:, :3], two_objects()[:, :3])

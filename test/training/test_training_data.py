@@ -129,7 +129,7 @@ def test_stream_depends_only_on_seed():
 def scene_of_two(**changes) -> TrainingScene:
     boxes = BOXES.numpy().astype(np.float64)
     return TrainingScene(**{**dict(points=two_objects(), boxes=boxes, wanted=np.ones(2, bool),
-                           class_ids=np.array([CAR, PEDESTRIAN])), **changes})
+                                   class_ids=np.array([CAR, PEDESTRIAN])), **changes})
 
 
 def labels_of(sample: Sample, anchors: torch.Tensor) -> torch.Tensor:
@@ -158,7 +158,7 @@ def test_share_of_scenes_gets_pasted_objects(tmp_path):
 
     def numbers(crowded: float) -> list[int]:
         prepare = ScenePreparation(tiny(), replace(STILL, pedestrians=1, crowded=crowded),
-                              database=tmp_path / "objects.npz")
+                                   database=tmp_path / "objects.npz")
         return [len(prepare(scene, rng).labels) for _ in range(10)]
 
     none, some, every = map(numbers, (0.0, 0.5, 1.0))
@@ -198,7 +198,7 @@ def test_scene_without_points_in_range_is_refused():
 def test_validation_scores_perfect_and_blind_detectors(tmp_path):
     root = broken_folder(tmp_path)
     scenes = SceneReader((open_labelled_frames(root).to_scenes(),),
-                        partial(load_validation_frame, tiny()))
+                         partial(load_validation_frame, tiny()))
     right = validate_detector(lambda frame: DetectionResult(Detections.of([WALKER])), scenes)
     blind = validate_detector(lambda frame: DetectionResult(Detections.none()), scenes)
     assert right.compute()["frames"] == 3 and len(right.skipped) == 2

@@ -29,7 +29,7 @@ def _runs(weights: Path | None) -> Runs:
     """Return ground and clustering with the parameters that the network was trained with."""
     fields = collect_fields(default_params(_file(weights)))
     return Runs("ground and clustering", {name: f for name, f in fields.items()
-                                 if name.startswith(("ground.", "clustering."))},
+                                          if name.startswith(("ground.", "clustering."))},
                 ("pointnet_detector",))
 
 

@@ -130,7 +130,7 @@ def _parse_boxes(where: str, rows: list) -> GlobalBoxes:
                          ) from None
     numbers = np.column_stack([boxes.centres, boxes.sizes, boxes.scores])
     invalid = ~((np.abs(numbers) <= LARGEST).all(axis=1) & (boxes.sizes > 0).all(axis=1)
-                  & are_valid_rotations(boxes.rotations)
+                & are_valid_rotations(boxes.rotations)
                 & ~(np.abs(boxes.velocities) > LARGEST).any(axis=1))
     if invalid.any():
         raise InputError(f"{where}, box {np.flatnonzero(invalid)[0]}: translation, size, rotation "

@@ -157,7 +157,7 @@ class FusedDetector(NetworkDetector):
             clusters = pool.submit(cluster_obstacles, view.frame.xyz, is_ground, params.people,
                                    frame.xyz)
             columns = run_experts(view.frame, config, is_ground, view.take(cluster_ids),
-                              params.ground, params.clustering)
+                                  params.ground, params.clustering)
             found = self.proposer.propose(
                 view, *columns, ScoreParams.for_all_classes(settings.proposals),
                 replace(settings.nms, max_boxes=settings.max_proposals), settings.cpu_fallback)
@@ -190,7 +190,7 @@ class FusedDetector(NetworkDetector):
                 name: float(scored.scores[class_ids == CLASSES.index(name)].max(initial=0.0))
                 for name in self.classes}
         boxes = move_cars_to_points(found.boxes, found.class_ids, proposals.obstacles,
-                               settings.on_points)
+                                    settings.on_points)
         heights = fit_ground_heights(proposals.ground, boxes[:, :2])
         moved = replace(found, boxes=move_to_ground(boxes, heights, settings.on_ground).astype(
             np.float32))

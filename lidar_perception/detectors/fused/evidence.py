@@ -29,7 +29,7 @@ Evidence = dict[str, np.ndarray]
 
 
 def find_silhouette_confidence(boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray,
-                  cluster_ids: np.ndarray) -> np.ndarray:
+                               cluster_ids: np.ndarray) -> np.ndarray:
     """Return the highest confidence that a cluster near each box is a pedestrian.
 
     Args:

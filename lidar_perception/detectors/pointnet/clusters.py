@@ -95,7 +95,7 @@ class ClusterInput:
 
 
 def make_clusters(frame: PointCloud, cluster_ids: np.ndarray, min_points: int = 1,
-                ground: np.ndarray | None = None) -> Clusters:
+                  ground: np.ndarray | None = None) -> Clusters:
     """Return the clusters of a frame of N points, in the order of their ids.
 
     Args:

@@ -199,8 +199,8 @@ class NetworkConfig:
 
 
 def make_config(version: str = "v0", size: str = "full",
-                   classes: tuple[str, ...] = tuple(DETECTED),
-                   **changes: Any) -> NetworkConfig:
+                classes: tuple[str, ...] = tuple(DETECTED),
+                **changes: Any) -> NetworkConfig:
     """Make the config of a version and size.
 
     Args:

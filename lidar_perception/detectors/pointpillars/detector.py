@@ -65,7 +65,7 @@ class PointPillarsDetector(NetworkDetector):
                                  settings.use_intensity)
         t1 = perf_counter()
         columns = run_experts(view.frame, config, view.take(ground), view.take(cluster_ids),
-                          self.params.ground, self.params.clustering)
+                              self.params.ground, self.params.clustering)
         t2 = perf_counter()
         found = self.proposer.propose(view, *columns, settings.scores, settings.nms,
                                       settings.cpu_fallback)

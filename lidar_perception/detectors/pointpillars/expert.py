@@ -41,9 +41,9 @@ class NetworkInput:
 
 
 def make_network_input(view: PointCloud, config: NetworkConfig, ground: np.ndarray | None = None,
-                  cluster_ids: np.ndarray | None = None,
-                  ground_params: GroundParams = EXPERT_GROUND,
-                  clustering: ClusteringParams = EXPERT_CLUSTERING) -> NetworkInput:
+                       cluster_ids: np.ndarray | None = None,
+                       ground_params: GroundParams = EXPERT_GROUND,
+                       clustering: ClusteringParams = EXPERT_CLUSTERING) -> NetworkInput:
     """Make the input arrays of a version from the N points of a NormalizedView.
 
     Args:

@@ -67,7 +67,7 @@ PROJECTS = (
 
 
 def import_weights(path: str | Path, classes: tuple[str, ...] = ()) -> tuple[NetworkConfig,
-                                                                            PointPillars, str]:
+                                                                             PointPillars, str]:
     """Import a .pth file of a network with KITTI's range and 0.16 m pillars.
 
     Args:
@@ -159,9 +159,9 @@ def _make_config(project: Project, per_cell: int, classes: tuple[str, ...],
                                 + known[name].size[2] / 2, known[name].matched,
                                 known[name].unmatched) for name in names)
     return make_config("v0", "full", xy_scale=1.0, anchors=anchors, max_points=MAX_POINTS,
-                          zero_row=True, middle_z=True, yaws=(0.0, 1.57),
-                          anchors_at=project.anchors_at,
-                          direction_offset=project.direction_offset)
+                       zero_row=True, middle_z=True, yaws=(0.0, 1.57),
+                       anchors_at=project.anchors_at,
+                       direction_offset=project.direction_offset)
 
 
 def _map_names(project: Project, config: NetworkConfig) -> dict[str, str]:

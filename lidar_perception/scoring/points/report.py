@@ -85,7 +85,7 @@ def measure_methods(
         if camera is not None:
             _, scan = crop_to_view(scan, camera, params.view)
         return SegmentationResult({}, score_methods(scan, segment_ground(scan, params.ground),
-                                                find_objects_in_boxes(scan.xyz, truth)),
+                                                    find_objects_in_boxes(scan.xyz, truth)),
                                   whole=camera is None and params.view.enabled)
 
     def score_methods(scan: PointCloud, ground: np.ndarray, objects: Objects) -> dict:

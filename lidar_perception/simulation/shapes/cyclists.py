@@ -139,7 +139,7 @@ def make_bicycle(rng: np.random.Generator) -> np.ndarray:
 def make_motorcycle(rng: np.random.Generator) -> np.ndarray:
     """Make a parked motorcycle or scooter (P,) PART."""
     return parts(_motorcycle_parts(rng.uniform(1.8, 2.2), rng.uniform(0.05, 0.5),
-                             rng.uniform(0.25, 0.31)), MOTORCYCLE)
+                                   rng.uniform(0.25, 0.31)), MOTORCYCLE)
 
 
 def _motorcycle_parts(length: float, paint: float, radius: float) -> list[tuple]:

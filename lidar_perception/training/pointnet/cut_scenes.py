@@ -140,7 +140,7 @@ def cut_clusters(scene: TrainingScene, config: PointNetConfig, min_points: int,
                        normalize_intensity(scene.points[:, 3]))
     ground = segment_ground(frame, config.ground)
     clusters = make_clusters(frame, cluster_obstacles(frame.xyz, ground, config.clustering, sensed),
-                           min_points, ground)
+                             min_points, ground)
     labels, owners = label_clusters(clusters, scene.boxes, scene.class_ids, config.classes)
     unwanted = (owners >= 0) & ~np.append(scene.wanted, False)[owners]
     labels[unwanted], owners[unwanted] = UNKNOWN, -1
