@@ -128,11 +128,13 @@ class NetworkDetector:
 
 
 def make_synthetic_frame(pose: SensorPoseParams) -> PointCloud:
-    """Return flat ground with two objects on it, one of them dense, for the first run."""
+    """Return flat ground with three objects on it for the first run: one of them dense, and one
+    across the limit of two bands of DBSCAN."""
     rng = np.random.default_rng(0)
     ground = rng.uniform(0, 40, (2000, 3)) * [1, 1, 0.001] - [0, 20, SENSOR_HEIGHT]
     target = rng.uniform(-0.5, 0.5, (400, 3)) + [8, 0, -0.8]
     dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 4, -0.8]  # DBSCAN has other code for these
-    xyz = np.concatenate([ground, target, dense]).astype(np.float32)
+    across = rng.uniform(-0.3, 0.3, (400, 3)) + [15, 0, -0.8]
+    xyz = np.concatenate([ground, target, dense, across]).astype(np.float32)
     xyz[:, 2] -= pose.height - SENSOR_HEIGHT
     return PointCloud(xyz, rng.uniform(0.1, 0.9, len(xyz)).astype(np.float32))

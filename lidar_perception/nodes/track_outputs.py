@@ -12,9 +12,10 @@ import numpy as np
 from lidar_perception.nodes.ego import EgoInput
 from lidar_perception.nodes.runtime import MARKERS, RELIABLE, LidarNode
 from lidar_perception.params import DetectionNodeParams, TrackerNodeParams
+from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.tracking.ego import NO_SOURCE
 from lidar_perception.tracking.state import Tracks
-from lidar_perception.tracking.tracker import Tracker
+from lidar_perception.tracking.tracker import Tracker, warm_up
 from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import Detections
 from lidar_perception.wire.array_codec import encode_detection_array
@@ -41,6 +42,8 @@ class TrackOutputs:
     def __init__(self, node: LidarNode,
                  params: Callable[[], DetectionNodeParams | TrackerNodeParams], clouds: bool):
         self.node, self.params = node, params
+        with lock_compilation(node.get_logger().info):
+            warm_up()
         self.tracker = Tracker(params().tracking)
         self.ego = EgoInput(node, lambda: params().ego, clouds)
         self.pose_source = NO_SOURCE, True, 0  # of the last frame

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidar_perception.classes import CAR
 from lidar_perception.robot.poses import transform_boxes
 from lidar_perception.tracking import motion
 from lidar_perception.tracking.ego import Ego, advance_ego, is_jump, is_valid_pose
@@ -204,3 +205,11 @@ def _to_sensor_frame(states: States, ego: Ego, seen: np.ndarray,
     return Tracks(chosen.ids, detections, velocities, chosen.moving, covariances,
                   side * chosen.means[:, 5],
                   chosen.height_variances, seen[indices], chosen.ages)
+
+
+def warm_up() -> None:
+    """Track two overlapping boxes over two frames to trigger JIT compilation."""
+    boxes = np.array([[10, 0, -1, 4, 2, 1.5, 0], [10.5, 0, -1, 4, 2, 1.5, 0]], np.float32)
+    tracker = Tracker()
+    for stamp_ns in (1, 10**8):
+        tracker(Detections.of(boxes, CAR, np.full(2, 0.9)), stamp_ns)

@@ -23,7 +23,9 @@ rng = np.random.default_rng(1)
 walls = rng.uniform([5, -9, -1], [5.1, 9, 2], (20_000, 3))
 spread = rng.uniform([-40, -40, -1.8], [40, 40, -1.7], (20_000, 3))
 dense = rng.normal([12, 3, 0], 0.05, (8_000, 3))
-cloud = PointCloud(np.concatenate([walls, spread, dense]).astype(np.float32))
+people = rng.uniform(-0.3, 0.3, (900, 3)) * [1, 1, 3] + (
+    [[15, 0, -0.8], [30, 5, -0.8], [9, -4, -0.8]] * 300)
+cloud = PointCloud(np.concatenate([walls, spread, dense, people]).astype(np.float32))
 """
 NODES = COUNT + """
 from lidar_perception.candidates.warm_up import (
@@ -53,6 +55,18 @@ before = compiled()
 detector(cloud)
 assert compiled() == before, {k: v for k, v in compiled().items() if before.get(k) != v}
 """
+TRACKER = COUNT + """
+from lidar_perception.tracking.tracker import Tracker, warm_up
+from lidar_perception.types import Detections
+
+warm_up()
+before, tracker = compiled(), Tracker()
+for frame in range(1, 9):
+    boxes = rng.uniform([-40, -40, -2, 1, 1, 1, -3], [40, 40, 0, 5, 2, 2, 3], (100, 7))
+    tracker(Detections.of(boxes.astype(np.float32), np.arange(100) % 3, np.full(100, 0.9)),
+            frame * 10**8)
+assert before and compiled() == before, {k: v for k, v in compiled().items() if before.get(k) != v}
+"""
 needs_numba = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="Numba compiles nothing")
 
 
@@ -66,3 +80,8 @@ def test_dense_cloud_compiles_nothing_after_loading_a_detector(detector):
 @pytest.mark.parametrize("method, density", [("dbscan", 0), ("euclidean", 0), ("euclidean", 9)])
 def test_cloud_after_warm_up_compiles_nothing(method, density):
     subprocess.run([sys.executable, "-c", NODES, method, str(density)], check=True)
+
+
+@needs_numba
+def test_tracks_after_warm_up_compile_nothing():
+    subprocess.run([sys.executable, "-c", TRACKER], check=True)

@@ -62,7 +62,7 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
 
     Returns:
         clouds, results (number of frames), latency_ms (median and p95 from sending a cloud to
-        receiving its detections in the player), memory_mb (proportional set size),
+        receiving its tracks in the player), memory_mb (proportional set size),
         memory_mb_by_process, cpu_ms_by_process (CPU time per cloud), stage_ms (median time of each
         node per cloud), one_process, slower (slowdown of the replay against `rate`), poses (their
         source for the tracker, see recorded_source), and for candidates the scores of the
@@ -118,7 +118,7 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         rules += [relative_name(ODOMETRY)] if poses == "recording" else []
         first, last = CpuTimes(), CpuTimes()  # at the first and the last result
         running.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
-                                         "wait_for": rules, "follow": [stages[FINAL]],
+                                         "wait_for": rules, "follow": [TRACKS],
                                          "ahead": 0 if real_time else AHEAD})
         memory: dict[str, float] = {}
         with make_progress() as bar:
