@@ -12,6 +12,7 @@ BEV and 3D such regions have no extent.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -158,10 +159,10 @@ def compute_precision(frames: Comparison, name: str, metric: str, overlap: float
     Returns None without counted labels. Orientation is NaN if a hit has no angle.
     """
     pairs = _collect_pairs(frames, name, metric, overlap, difficulty)
-    objects = int((pairs[2] == COUNTED).sum())
+    objects = int((pairs.labels == COUNTED).sum())
     if objects == 0:
         return None
-    thresholds = choose_thresholds(_find_hit_scores(*pairs), objects)
+    thresholds = choose_thresholds(_find_hit_scores(pairs), objects)
     hits, wrong, turned = _count(frames, pairs, metric, thresholds)
     right = hits / np.maximum(hits + wrong, 1)
     turned = turned / np.maximum(hits + wrong, 1)
@@ -180,78 +181,78 @@ def count_hits(frames: Comparison, name: str, metric: str, overlap: float, diffi
     return _count(frames, pairs, metric, np.asarray(thresholds, np.float64))[:2]
 
 
-def _collect_pairs(
-    frames: Comparison, name: str, metric: str, overlap: float, difficulty: str
-) -> tuple:
-    """Return the arguments of _find_hit_scores."""
-    return (frames.overlaps[METRICS.index(metric)], overlap,
-            classify_labels(frames.true, name, difficulty),
-            classify_detections(frames.found, name, difficulty),
-            frames.found.scores, frames.first_true, frames.first_found, frames.first_pair)
+class _Pairs(NamedTuple):
+    """Pairs of labels and detections of all frames, for one class, metric and difficulty.
+
+    Attributes:
+        overlaps: (P,) of the pairs.
+        min_overlap: a hit has a larger one.
+        labels, detections: (M,) and (K,) int8 COUNTED, IGNORED or OTHER.
+        scores: (K,) of the detections.
+        first_true, first_found, first_pair: as in Comparison.
+    """
+
+    overlaps: np.ndarray
+    min_overlap: float
+    labels: np.ndarray
+    detections: np.ndarray
+    scores: np.ndarray
+    first_true: np.ndarray
+    first_found: np.ndarray
+    first_pair: np.ndarray
 
 
-def _count(frames: Comparison, pairs: tuple, metric: str, thresholds: np.ndarray) -> tuple:
+def _collect_pairs(frames: Comparison, name: str, metric: str, overlap: float,
+                   difficulty: str) -> _Pairs:
+    return _Pairs(frames.overlaps[METRICS.index(metric)], overlap,
+                  classify_labels(frames.true, name, difficulty),
+                  classify_detections(frames.found, name, difficulty),
+                  frames.found.scores, frames.first_true, frames.first_found, frames.first_pair)
+
+
+def _count(frames: Comparison, pairs: _Pairs, metric: str, thresholds: np.ndarray) -> tuple:
     """Call _count_hits with pairs at thresholds (T,)."""
-    excused = (frames.excused if metric == "image" else np.zeros(len(frames.found))) > pairs[1]
-    return _count_hits(*(*pairs, thresholds, excused, frames.true.alpha, frames.found.alpha))
+    excused = (frames.excused if metric == "image"
+               else np.zeros(len(frames.found))) > pairs.min_overlap
+    return _count_hits(pairs, thresholds, excused, frames.true.alpha, frames.found.alpha)
 
 
 @njit(cache=True, nogil=True)
-def _find_hit_scores(
-    overlaps,
-    least,
-    classify_labels,
-    classify_detections,
-    scores,
-    first_true,
-    first_found,
-    first_pair,
-):
+def _find_hit_scores(pairs):
     """Return the scores of detections that hit a counted label.
 
     Each label takes the unmatched detection with the highest score.
     """
+    overlaps, min_overlap, labels, detections, scores, first_true, first_found, first_pair = pairs
     hits, number = np.empty(len(scores)), 0
     taken = np.zeros(len(scores), np.bool_)
     for f in range(len(first_pair) - 1):
         count = first_true[f + 1] - first_true[f]
         for i in range(first_true[f], first_true[f + 1]):
-            if classify_labels[i] == OTHER:
+            if labels[i] == OTHER:
                 continue
             best = -1
             for j in range(first_found[f], first_found[f + 1]):
                 pair = first_pair[f] + (j - first_found[f]) * count + i - first_true[f]
-                if (classify_detections[j] != OTHER and not taken[j] and overlaps[pair] > least
+                if (detections[j] != OTHER and not taken[j] and overlaps[pair] > min_overlap
                         and (best < 0 or scores[j] > scores[best])):
                     best = j
             if best >= 0:
                 taken[best] = True
-                if classify_labels[i] == COUNTED and classify_detections[best] == COUNTED:
+                if labels[i] == COUNTED and detections[best] == COUNTED:
                     hits[number] = scores[best]
                     number += 1
     return hits[:number]
 
 
 @njit(cache=True, nogil=True)
-def _count_hits(
-    overlaps,
-    least,
-    classify_labels,
-    classify_detections,
-    scores,
-    first_true,
-    first_found,
-    first_pair,
-    thresholds,
-    excused,
-    true_alpha,
-    found_alpha,
-):
+def _count_hits(pairs, thresholds, excused, true_alpha, found_alpha):
     """Count hits, wrong detections and summed angle similarity of hits at each threshold, (T,).
 
     Each label takes the unmatched detection with the highest overlap, an ignored one only if there
     is no other.
     """
+    overlaps, min_overlap, labels, detections, scores, first_true, first_found, first_pair = pairs
     hits, wrong, turned = (np.zeros(len(thresholds)), np.zeros(len(thresholds)),
                            np.zeros(len(thresholds)))
     taken = np.zeros(len(scores), np.int64)  # at which threshold, from 1
@@ -262,24 +263,24 @@ def _count_hits(
             while end < first_found[f + 1] and scores[end] >= thresholds[t]:
                 end += 1
             for i in range(first_true[f], first_true[f + 1]):
-                if classify_labels[i] == OTHER:
+                if labels[i] == OTHER:
                     continue
                 best, most = -1, 0.0
                 for j in range(first_found[f], end):
                     overlap = overlaps[first_pair[f] + (j - first_found[f]) * count
                                        + i - first_true[f]]
-                    if classify_detections[j] == OTHER or taken[j] == t + 1 or not overlap > least:
+                    if detections[j] == OTHER or taken[j] == t + 1 or not overlap > min_overlap:
                         continue
-                    if classify_detections[j] == COUNTED and overlap > most:
+                    if detections[j] == COUNTED and overlap > most:
                         best, most = j, overlap
-                    elif classify_detections[j] == IGNORED and best < 0:
+                    elif detections[j] == IGNORED and best < 0:
                         best = j
                 if best >= 0:
                     taken[best] = t + 1
-                    if classify_labels[i] == COUNTED and classify_detections[best] == COUNTED:
+                    if labels[i] == COUNTED and detections[best] == COUNTED:
                         hits[t] += 1
                         turned[t] += (1 + np.cos(true_alpha[i] - found_alpha[best])) / 2
             for j in range(first_found[f], end):
-                if classify_detections[j] == COUNTED and taken[j] != t + 1 and not excused[j]:
+                if detections[j] == COUNTED and taken[j] != t + 1 and not excused[j]:
                     wrong[t] += 1
     return hits, wrong, turned
