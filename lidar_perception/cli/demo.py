@@ -59,7 +59,7 @@ from lidar_perception.wire.track_markers import read_trails
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import to_ns
 
-RECORD = "demo.json"                      # in the output folder: what was replayed
+RECORD = "demo.json"                      # in the output folder: data and detector
 BEHIND_M = 2.0                            # detections this far behind need a picture of all sides
 REPLACED = ("drive", "result", "logs")    # folders that the next demo replaces
 

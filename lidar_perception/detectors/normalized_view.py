@@ -79,8 +79,8 @@ class NormalizedView:
         lack = ("has no intensity" if intensity is None else
                 "has the intensity 0 everywhere" if not intensity.any() else
                 "has the same intensity nearly everywhere")
-        return (f"the cloud {lack}, without which fewer people are found; use_intensity false if "
-                "the sensor has none")
+        return (f"the cloud {lack}, without which fewer people are found; set use_intensity to "
+                "false if the sensor has none")
 
 
 def _indices_in_range(xyz: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -58,7 +58,7 @@ class Summary:
     """Counts of a data set that was written.
 
     Attributes:
-        remarks: what was left out or assumed, and in how many frames.
+        remarks: omissions and assumptions, with their numbers of frames.
     """
 
     frames: int = 0
@@ -137,7 +137,7 @@ def _load_cloud(frame: Frame, summary: Summary) -> np.ndarray:
 
 
 def _remark_losses(summary: Summary, placed: DatasetFrame, kept: str) -> None:
-    """Add remarks about content that the layout cannot store; `kept` lists what it stores."""
+    """Add remarks about content that the layout cannot store; `kept` lists what it can."""
     labels = placed.labels
     for content, exists in (("poses", placed.frame.pose() is not None),
                             ("point labels", placed.frame.point_truth() is not None),

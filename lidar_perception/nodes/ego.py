@@ -104,7 +104,7 @@ class EgoInput:
         return None
 
     def find_problem(self, frame_id: str, stamp: int) -> str | None:
-        """Return what is wrong with the poses of the last frame, with the remedy, or None."""
+        """Return the problem of the last frame's poses with its remedy, or None."""
         wanted, odometry_child = self.params().source, self.transforms.odometry_child
         last = self.transforms.odometry_ns
         if self.source == "odometry" and last is not None:

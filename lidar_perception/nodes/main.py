@@ -208,7 +208,7 @@ def _run_nodes(given: list[tuple[type, list[str], dict[str, Any]]], shared: list
         stop.finish_closing(code)
         for node in nodes:
             node.destroy_node()
-        del kept  # shuts down DDS here, where the guard ends a hang
+        del kept  # shuts down DDS while the guard can still end a hang
         rclpy.try_shutdown()
     return code
 

@@ -234,7 +234,7 @@ class Reception:
     def _may_wait(self, elapsed: float) -> bool:
         """Return True while a cloud may still wait for its input.
 
-        elapsed: seconds since a cloud last got what it needed. After max_wait, clouds wait only
+        elapsed: seconds since a cloud last had all its inputs. After max_wait, clouds wait only
         from time to time, in case the input comes back.
         """
         excess = elapsed - self.params().max_wait

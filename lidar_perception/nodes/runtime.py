@@ -142,7 +142,7 @@ class LidarNode(Node):
             type_name: message type such as "std_msgs/msg/Bool".
             callback: called with each message, in the class of rosbags that offline code reads from
                 bags. It is a view of the received bytes, which rclpy copies several times. Types
-                that rosbags does not know come in the class of rclpy.
+                that rosbags does not know have the class of rclpy.
             qos: each profile gets its own subscription, as one may not match all publishers.
                 Without any, the topic has a Reception.
             private: the topic is below ~/input.
@@ -321,7 +321,7 @@ class LidarNode(Node):
         executor.spin_until_future_complete(self.stop)
 
     def close(self) -> None:
-        """Write what is left; called once before the node is destroyed.
+        """Write results that are still in memory; called once before the node is destroyed.
 
         Raises:
             InputError: the results cannot be written.

@@ -14,7 +14,7 @@ POLL_PERIOD_S = 0.05  # while the guard is loaded
 
 
 class Stop:
-    """Handler of signals in threads of its own; every thread of the process must block the signals.
+    """Handle signals in dedicated threads; all threads of the process must block the signals.
 
     An exception in the main thread could be lost in a destructor, or interrupt work that must be
     finished. Fast DDS can wait for a lock in shared memory that a dead process still holds, while

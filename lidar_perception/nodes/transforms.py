@@ -63,7 +63,7 @@ class Transforms:
         self.odometry_child = self.odometry_frame = ""  # child frame and frame of the odometry
         self.odometry_ns: int | None = None  # stamp of the last one
         self.odometry_arrival = self.ignored_arrival = -inf  # monotonic
-        self.more_needs: list[Callable[[Any], str | None]] = []  # what else a header waits for
+        self.more_needs: list[Callable[[Any], str | None]] = []  # other inputs of a header
         self.sweep: float | None = None  # seconds from the stamp to the last point of a cloud
         self.problem_by_source: dict[str, str] = {}  # problems by the parameter that causes them
         self.diagnostic_values: dict[str, Any] = {}

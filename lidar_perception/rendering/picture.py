@@ -64,7 +64,7 @@ class Stage:
 
     Attributes:
         reach: range that is shown, metres from the sensor.
-        ahead: True to show what is ahead, False for all around.
+        ahead: True to show the area ahead only, False for all around.
         ground: z of the ground at the sensor.
         color: colour of the points, "height" or "intensity".
         width, height: pixels.

@@ -21,7 +21,7 @@ def group_frames(names: Sequence[str], follow: bool = False) -> list[np.ndarray]
     Args:
         names: names of the frames.
         follow: True if frames without a drive are consecutive, as in a bag; they are then one
-            drive. Otherwise each is a drive of its own, as in KITTI's object layout.
+            drive. Otherwise each frame counts as one drive, as in KITTI's object layout.
 
     Returns:
         Indices of the frames of each group.

@@ -5,7 +5,7 @@
 
 start(recording) is called once per process and returns measure(frame), which returns any picklable
 result, or None for a frame without one. InputError from measure, or from reading the frame in it,
-skips the frame. Results come in the order of the frames in all cases.
+skips the frame. Results are in the order of the frames.
 """
 
 from __future__ import annotations

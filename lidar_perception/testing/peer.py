@@ -25,7 +25,7 @@ LEVELS = {0: "OK", 1: "WARN", 2: "ERROR", 3: "STALE"}
 class Peer(ExternalNode):
     """Talks over DDS on a domain, by default that of the environment. A context manager.
 
-    A wait that fails raises an AssertionError that describes what was received instead: after the
+    A wait that fails raises an AssertionError that describes the messages received: after the
     timeout, or at once if one of `processes` has ended with an error.
 
     Types of messages are names such as "std_msgs/msg/Bool", or classes. Received messages are of

@@ -102,7 +102,7 @@ def choose_source(wanted: str, available: Collection[str]) -> str:
 
 
 def choose_recorded_source(has_poses: bool, wanted: str = "auto") -> str:
-    """Choose the source of poses for recorded frames, which may have poses of their own.
+    """Choose the source of poses for recorded frames, which may come with poses.
 
     A source other than "auto" is assumed to be available; it reports itself if it is not.
     """

@@ -30,7 +30,7 @@ class Tracker:
 
     Attributes:
         params: may be replaced between calls.
-        problem: what was wrong with the last frame, or None.
+        problem: problem of the last frame, or None.
         frame_used: False if the last frame was ignored.
         started, ended: number of tracks so far.
     """

@@ -149,7 +149,6 @@ def test_what_may_be_misspelt_in_a_parameter_file_is_said(text, said, tmp_path, 
 
 
 def test_settings_of_a_detector_take_effect_and_win():
-    """Over the threshold and the height that a verb gives, and in what is loaded."""
     made = chosen("--weights", "pointpillars", *given(
         "pointpillars.scores.car=0.7", "pointpillars.range=around", "pointpillars.device=cpu",
         "pointpillars.warm_up=no"))["detector"]

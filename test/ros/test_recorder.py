@@ -62,7 +62,7 @@ def test_a_type_that_is_not_installed_ends_no_recording(monkeypatch, peer, start
 
 
 def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tmp_path):
-    """What waits has a bound, whatever comes; the clock of a simulation may stand."""
+    """Also while simulated time does not advance."""
     from lidar_perception.nodes.replay import bag_recorder
     monkeypatch.setattr(bag_recorder, "MAX_QUEUED", 100)
     held = threading.Event()

@@ -36,7 +36,8 @@ def find_silhouette_confidence(boxes: np.ndarray, xyz: np.ndarray, ground: np.nd
         boxes: (K, 7) proposals.
         xyz: (N, 3) points that are not ground.
         ground: (G, 3) ground points.
-        cluster_ids: (N,) ids of clusters made for people, 1..J, 0 for no cluster.
+        cluster_ids: (N,) cluster ids 1..J, 0 for no cluster; clustered with the parameters for
+            people.
 
     Returns:
         (K,) float64, 0..1; 0 for boxes without a cluster of a suitable size.

@@ -22,7 +22,7 @@ from lidar_perception.ground.params import GroundParams
 from lidar_perception.groups import renumber_ids
 from lidar_perception.types import PointCloud
 
-MAP_KINDS = ("vehicle", "cyclist", "pedestrian")  # one channel each, whatever the classes
+MAP_KINDS = ("vehicle", "cyclist", "pedestrian")  # one channel each, for all sets of classes
 # Index into MAP_KINDS by class; the last entry, -1, is for clusters without a class.
 CHANNELS = np.array([*(MAP_KINDS.index(row.moves_as) for row in TABLE), -1])
 
@@ -94,8 +94,8 @@ def draw_clusters(xyz: np.ndarray, cluster_ids: np.ndarray, config: NetworkConfi
     """Draw the 2D pseudo-map of clusters (paper B, Section 3.1.2).
 
     Clusters are classified by the diagonal of their minimum-area rectangle and drawn as filled
-    ellipses into the channel of their kind. An ellipse fills the cells with their centre inside it,
-    and the cell of its own centre.
+    ellipses into the channel of their kind. An ellipse fills the cells whose centres are inside it,
+    and the cell that contains the centre of the ellipse.
 
     Args:
         xyz: (N, 3) points with cluster ids (N,), 1..K.

@@ -20,22 +20,22 @@ LEVEL = "moderate"
 
 
 def score_at_threshold(frames: list[ComparedFrame]) -> dict[str, dict[str, float]]:
-    """Score all detections, whatever their score, by class.
+    """Score by class the detections that the detector reports at its thresholds.
 
     BEV, relaxed overlap, moderate difficulty. Returns labels, hits, wrong, missed, precision,
     recall and f1, ratios 0 without cases; empty without frames.
     """
     if not frames:
         return {}
-    concatenate = Comparison.of(frames)
-    return {name: _score_class(concatenate, name) for name in SCORED}
+    comparison = Comparison.of(frames)
+    return {name: _score_class(comparison, name) for name in SCORED}
 
 
-def _score_class(concatenate: Comparison, name: str) -> dict[str, float]:
+def _score_class(comparison: Comparison, name: str) -> dict[str, float]:
     every = np.array([-np.inf])
-    hits, wrong = (int(n[0]) for n in count_hits(concatenate, name, "bev", RELAXED[name], LEVEL,
+    hits, wrong = (int(n[0]) for n in count_hits(comparison, name, "bev", RELAXED[name], LEVEL,
                                                  every))
-    labels = int((classify_labels(concatenate.true, name, LEVEL) == COUNTED).sum())
+    labels = int((classify_labels(comparison.true, name, LEVEL) == COUNTED).sum())
     return {"labels": labels, "hits": hits, "wrong": wrong, "missed": labels - hits,
             "precision": hits / max(hits + wrong, 1), "recall": hits / max(labels, 1),
             "f1": 2 * hits / max(hits + wrong + labels, 1)}

@@ -3,7 +3,7 @@
 Geiger, Lenz, Urtasun, CVPR 2012, and the benchmark's own program. For a class and a difficulty a
 label is counted (must be detected), ignored (may be detected: too small in the image, too occluded
 or truncated for the difficulty, or of a neighbour class) or other (has no effect). A detection is
-counted, ignored if it is lower than the minimum height, whatever its class, or other. Detections
+counted, ignored if it is lower than the minimum height (of any class), or other. Detections
 are matched twice: by score, to find the thresholds at which recall rises, and by overlap at each
 threshold, to count. A detection inside a DontCare region is not a false positive in the image; in
 BEV and 3D such regions have no extent.
