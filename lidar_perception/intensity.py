@@ -76,7 +76,8 @@ def to_unit(values: np.ndarray, full: float) -> np.ndarray:
     return values / np.float32(full)
 
 
-def normalize_intensity(intensity: np.ndarray | None) -> np.ndarray | None:
+def normalize_intensity(intensity: np.ndarray | None,
+                        indices: np.ndarray | None = None) -> np.ndarray | None:
     """Map the intensities of a cloud to the distribution that networks are trained with.
 
     The result depends on the order of the intensities only, so that gain, gamma and scale of the
@@ -84,20 +85,22 @@ def normalize_intensity(intensity: np.ndarray | None) -> np.ndarray | None:
 
     Args:
         intensity: (N,) intensities, NaN for unknown ones, or None.
+        indices: (M,) points to return; None: all.
 
     Returns:
-        (N,) float32; None without a usable intensity, see has_usable_intensity.
+        (N,) or (M,) float32; None without a usable intensity, see has_usable_intensity.
     """
     if intensity is None or not has_usable_intensity(intensity):
         return None
-    positive = intensity > 0
-    values = intensity[positive]
-    knots = _compute_quantiles(values, np.array(REFERENCE_SHARES))
+    knots = _compute_quantiles(intensity[intensity > 0], np.array(REFERENCE_SHARES))
     # Of equal knots, the middle one counts: np.interp needs them to rise.
     unique, inverse = np.unique(knots, return_inverse=True)
     middles = np.bincount(inverse, REFERENCE_VALUES) / np.bincount(inverse)
+    if indices is not None:
+        intensity = intensity.take(indices)
+    positive = intensity > 0
     normalized = np.where(np.isnan(intensity), intensity, np.float32(0)).astype(np.float32)
-    normalized[positive] = np.interp(values, unique, middles)
+    normalized[positive] = np.interp(intensity[positive], unique, middles)
     return normalized
 
 

@@ -119,6 +119,8 @@ def test_normalized_intensity_ignores_gain_and_gamma(change):
     normalized = normalize_intensity(intensity)
     np.testing.assert_allclose(normalize_intensity(change(intensity)), normalized, atol=0.02)
     assert (normalized[::10] == 0).all() and normalized.dtype == np.float32
+    np.testing.assert_array_equal(normalize_intensity(intensity, np.arange(7, 900)),
+                                  normalized[7:900])
     positive = normalized[normalized > 0]
     np.testing.assert_allclose(np.quantile(positive, REFERENCE_SHARES), REFERENCE_VALUES,
                                atol=0.02)

@@ -56,9 +56,8 @@ class NormalizedView:
             indices = _indices_in_range(xyz, np.array(low, np.float32) - shift,
                                         np.array(high, np.float32) - shift)
             frame, xyz = source.take(indices), xyz.take(indices, axis=0)
-        intensity = normalize_intensity(source.intensity) if use_intensity else None
-        if intensity is not None and len(intensity) != len(indices):
-            intensity = intensity.take(indices)
+        intensity = normalize_intensity(
+            source.intensity, None if frame is source else indices) if use_intensity else None
         frame = replace(frame, xyz=xyz + shift, intensity=intensity)
         return NormalizedView(frame, indices, source, pose, use_intensity)
 
