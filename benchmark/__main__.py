@@ -16,13 +16,11 @@ import click
 import numpy as np
 
 from benchmark import clustering, ground, peers
-from benchmark.busy import measure_busy
 from benchmark.candidates import compare_candidates, print_comparison
 from benchmark.detection import measure_detection, measure_engines, print_detection
 from benchmark.graph import measure_graph, print_graph
 from benchmark.pointnet import measure_pointnet, print_pointnet
-from benchmark.rows import print_ground, print_measured, print_planes
-from benchmark.simulation import measure_simulation
+from benchmark.rows import print_ground, print_measured
 from benchmark.startup import measure_startup
 from benchmark.timing import choose_evenly
 from benchmark.tracking import measure_recording, print_tracking
@@ -41,7 +39,7 @@ from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
 FULL_SCAN = 60_000   # points; a scan cut to the camera's view has some 20,000
-FEW = 3              # frames with a pedestrian, below which those without serve too
+FEW = 3              # with fewer pedestrian frames, frames without pedestrians are used too
 
 
 @click.command(context_settings=dict(help_option_names=["-h", "--help"]))
@@ -52,9 +50,9 @@ FEW = 3              # frames with a pedestrian, below which those without serve
 @click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
               help="Write the figures to this file.")
 @click.option("--repeat", type=click.IntRange(1), default=5, show_default=True,
-              help="Runs a frame; its time is the median. Fewer for slow peers.")
+              help="Runs per frame; the median counts. Fewer for slow peers.")
 @click.option("--frames", "count", type=click.IntRange(1), default=8, show_default=True,
-              help="Frames for the single algorithms, evenly spread over the folder.")
+              help="Frames for the single algorithms, evenly spread over the recording.")
 @click.option("--graph/--no-graph", default=True, show_default=True,
               help="Also replay a bag of the frames through the nodes at 10 Hz.")
 def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int,
@@ -78,11 +76,11 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     labelled = [f for each in recordings if POINT_LABELS in each.has
                 for f in choose_evenly(each.frames, count)]
     warm_up()
-    content: dict[str, Any] = {"machine": {"cpu": read_cpu_name(), "cores": os.cpu_count(),
-                                           "python":
-                           platform.python_version(), "numpy": np.__version__},
-               "peers": {p.package: p.version() for p in peers.ALL},
-               "candidates": compare_candidates(frames, repeat)}
+    content: dict[str, Any] = {
+        "machine": {"cpu": read_cpu_name(), "cores": os.cpu_count(),
+                    "python": platform.python_version(), "numpy": np.__version__},
+        "peers": {p.package: p.version() for p in peers.ALL},
+        "candidates": compare_candidates(frames, repeat)}
     print_comparison(content["candidates"])
     in_view = [crop_to_view(f, camera, ViewParams(enabled=True))[1].xyz
                for f, camera in _with_camera(recording, frames, count)]
@@ -95,8 +93,6 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
         print_measured(content["engines"])
         content["pointnet"] = measure_pointnet(scans, repeat)
         print_pointnet(content["pointnet"])
-        content["busy"] = measure_busy(scans, repeat)
-        print_measured(content["busy"])
     if labelled:
         content["ground_scores"] = ground.measure_labelled(labelled, repeat)
         print_ground(content["ground_scores"])
@@ -104,8 +100,6 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
         if drives := measure_recording(each):
             content["tracking"] = drives
             print_tracking(drives)
-    content["simulation"] = measure_simulation(count, repeat)
-    print_measured(content["simulation"])
     content["startup"] = measure_startup(repeat)
     print_measured(content["startup"])
     if graph:
@@ -141,18 +135,14 @@ def _measure(in_view: list[np.ndarray], scans: list[PointCloud], repeat: int) ->
 
     show("dbscan_in_view", clustering.measure_dbscan("DBSCAN, in view", near, repeat, 12))
     show("threshold_in_view", ground.measure_threshold("Threshold, in view", in_view, repeat))
-    print_planes(content["threshold_in_view"])
     if not scans:
         errors.print(f"no scan has more than {FULL_SCAN} points: whole scans are not measured")
         return content
-    dbscan = clustering.measure_dbscan("DBSCAN, whole scan", far, repeat, 20)
-    clustering.add_limits(dbscan, far)
-    show("dbscan_whole_scan", dbscan)
+    show("dbscan_whole_scan", clustering.measure_dbscan("DBSCAN, whole scan", far, repeat, 20))
     for threshold in ("global", "local"):
         show(f"euclidean_{threshold}", clustering.measure_euclidean(rest, threshold, repeat))
     show("paper_c", clustering.measure_paper_c(whole, repeat))
     show("threshold", ground.measure_threshold("Threshold, whole scan", whole, repeat))
-    print_planes(content["threshold"])
     show("patchwork", ground.measure_patchwork(scans, repeat))
     show("cloth", ground.measure_cloth(whole, repeat))
     return content

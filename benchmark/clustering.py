@@ -12,7 +12,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmark import peers, plain_euclidean
-from benchmark.memory import METHOD, dbscan_memory
 from benchmark.rows import add_target, compute_speedup, make_measurement, make_row
 from benchmark.timing import SLOW_REPEAT, Clock, choose_evenly, run_in_child, thin
 from lidar_perception.clustering.dbscan import distance_aware_dbscan
@@ -76,16 +75,6 @@ def measure_dbscans(chosen: list[int], clouds: list[np.ndarray], repeat: int,
                              else have_same_clusters(theirs, ours, core))
             differ[p.name] += int(((theirs == 0) != (ours == 0)).sum())
     return clock.medians(), same, differ
-
-
-def add_limits(content: dict, clouds: list[np.ndarray]) -> None:
-    """Add rows to measure_dbscan on whole scans: time, and memory on the largest cloud."""
-    ms = content["rows"][0]["ours_ms"]
-    content["rows"].append(make_row("(time)", ours_ms=ms, value=ms, unit="ms", target=60))
-    memory = dbscan_memory(max(clouds, key=len))
-    content["rows"].append(make_row("(memory, largest)", value=memory, unit="MB", target=200,
-                                    note="" if memory is not None else "not measured"))
-    content["memory_method"] = METHOD
 
 
 def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> dict:

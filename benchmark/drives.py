@@ -1,4 +1,4 @@
-"""Trackers on simulated drives that were not used to choose parameters, with intervals by drive.
+"""Both trackers on simulated drives that were not used to tune parameters, with intervals.
 
     python -m benchmark.drives --drives 20 --seconds 20 --cache folder --json tracks.json
 
@@ -19,7 +19,6 @@ import numpy as np
 from rich.table import Table
 
 from benchmark.plain_ab3dmot import PlainAb3dmot
-from benchmark.precision import Curve, compute_precisions, make_curves
 from benchmark.tracking import Step, TrackedFrame, peer, tracker
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.seed_sources import make_automatic_source
@@ -47,7 +46,6 @@ NETWORKS = ("fused", "pointpillars", "pointnet")
 DETECTORS = {**dict.fromkeys(NETWORKS, (tuple(DETECTED), ScoreParams().car)),
              "candidates": (("Pedestrian",), BEST.confidence.threshold)}
 RESAMPLED, LEAST, INTERVAL = 2000, 0.001, (2.5, 97.5)
-RECALLS = (0.3, 0.5, 0.6)
 Drive = list[tuple[TrackedFrame, dict[str, Detections]]]
 Counts = dict[str, tuple[HotaCounts, ClearCounts]]
 
@@ -64,14 +62,8 @@ def detect(street: int, frames: int, people: float) -> Drive:
     for i in range(frames):
         scan = simulate_scan(street, i, HDL64E, Scenes(None, people))
         found = {name: _detect_street(each, scan.frame) for name, each in detectors.items()}
-        drive.append(
-            (
-                TrackedFrame(
-                    Detections.none(), make_kitti_labels(scan.truth), scan.frame.stamp_ns, scan.pose
-                ),
-                found,
-            )
-        )
+        drive.append((TrackedFrame(Detections.none(), make_kitti_labels(scan.truth),
+                                   scan.frame.stamp_ns, scan.pose), found))
     return drive
 
 
@@ -83,7 +75,7 @@ def _detect_street(detector: Detector, frame) -> Detections:
 
 
 def load_detections(folder: Path, street: int, frames: int, people: float) -> Drive:
-    """Return detected() from a folder, or compute and keep it there."""
+    """Load the result of detect() from a folder; compute and save it there if it is missing."""
     file = folder / f"{street}_{frames}_{people:g}.pkl"
     if not file.exists():
         folder.mkdir(parents=True, exist_ok=True)
@@ -104,25 +96,12 @@ def count_tracks(drive: list[TrackedFrame], step: Step, classes: tuple[str, ...]
 
 
 def measure_drives(drives: list[Drive], detector: str, params: TrackingParams) -> dict:
-    """Measure both trackers by class.
-
-    Returns their scores with intervals, and the precision of single frames and of tracks at equal
-    recall.
-    """
+    """Return the scores of both trackers with intervals, by class."""
     classes, operating = DETECTORS[detector]
     chosen = [[replace(seen, found=found[detector]) for seen, found in drive] for drive in drives]
     peers = [count_tracks(drive, peer(PlainAb3dmot(), operating), classes) for drive in chosen]
     ours = [count_tracks(drive, tracker(params), classes) for drive in chosen]
-    all_of_them = with_values(params, {"report": 0.0})
-    single = [make_curves(drive, _single(), classes) for drive in chosen]
-    tracked = [make_curves(drive, tracker(all_of_them), classes) for drive in chosen]
-    return {name: {**_scores([p[name] for p in peers], [o[name] for o in ours]),
-                   "precision": _precision([s[name] for s in single], [t[name] for t in tracked])}
-            for name in classes}
-
-
-def _single() -> Step:
-    return lambda seen: (np.arange(len(seen.found)), seen.found)
+    return {name: _scores([p[name] for p in peers], [o[name] for o in ours]) for name in classes}
 
 
 def _scores(peers: list[tuple], ours: list[tuple]) -> dict:
@@ -142,29 +121,13 @@ def _scores(peers: list[tuple], ours: list[tuple]) -> dict:
             "gain_interval": _interval(difference)}
 
 
-def _precision(single: list[Curve], tracked: list[Curve]) -> dict:
-    each_once = np.ones((1, len(single)), int)
-    times = np.array(
-        [np.bincount(draw, minlength=len(single)) for draw in draw_drives(len(single))]
-    )
-    values = [compute_precisions(curves, RECALLS, np.concatenate([each_once, times]))
-              for curves in (single, tracked)]
-    return {str(recall): {"single": float(one[0]), "tracked": float(many[0]),
-                          "gain_interval": _interval(many[1:] - one[1:])}
-            for recall, one, many in zip(RECALLS, *(v.T for v in values))}
-
-
 def resample(drives: list, value: Callable[[list], float]) -> np.ndarray:
     """Return values (RESAMPLED,) over drives drawn with replacement.
 
     The draws are the same for the same number of drives, so differences are paired.
     """
-    return np.array([value([drives[i] for i in draw]) for draw in draw_drives(len(drives))])
-
-
-def draw_drives(count: int) -> np.ndarray:
-    """Draw indices (RESAMPLED, count) of drives, with a fixed seed."""
-    return np.random.default_rng(0).integers(0, count, (RESAMPLED, count))
+    draws = np.random.default_rng(0).integers(0, len(drives), (RESAMPLED, len(drives)))
+    return np.array([value([drives[i] for i in draw]) for draw in draws])
 
 
 def _interval(values: np.ndarray) -> list[float]:
@@ -174,8 +137,7 @@ def _interval(values: np.ndarray) -> list[float]:
 def print_drives(content: dict) -> None:
     """Print a row per detector and class: the peer, then ours, in percent."""
     table = Table(title=f"{content['drives']} drives of {content['seconds']:g} s")
-    for name in ("detector", "class", "boxes", "HOTA", "gain", "switches", "precision", "recall",
-                 *(f"precision at recall {r}" for r in RECALLS)):
+    for name in "detector", "class", "boxes", "HOTA", "gain", "switches", "precision", "recall":
         table.add_column(name)
     for detector, classes in content["detectors"].items():
         for name, own in classes.items():
@@ -184,9 +146,7 @@ def print_drives(content: dict) -> None:
             table.add_row(
                 detector, name, str(own["labels"]), pair[0],
                 f"{100 * own['gain']:+.1f} [{_range(own['gain_interval'])}]",
-                f"{own['peer']['switches']}, {own['ours']['switches']}", *pair[1:],
-                *(f"{100 * p['single']:.1f}, {100 * p['tracked']:.1f} "
-                  f"[{_range(p['gain_interval'])}]" for p in own["precision"].values()))
+                f"{own['peer']['switches']}, {own['ours']['switches']}", *pair[1:])
     console.print(table)
 
 
@@ -205,7 +165,7 @@ def _range(interval: list[float]) -> str:
 @click.option("--json", "json_file", type=click.Path(path_type=Path))
 def main(first: int, count: int, seconds: float, people: float, cache: Path,
          json_file: Path | None) -> None:
-    """Compare our tracker with a plain AB3DMOT and with single frames on simulated drives."""
+    """Compare our tracker with a plain AB3DMOT on simulated drives."""
     frames = round(seconds * HDL64E.rate)
     drives = [load_detections(cache, street, frames, people) for street in
               show_progress(range(first, first + count), "detecting", count)]

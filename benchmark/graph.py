@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 
-from benchmark.busy import run_busy_processes
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.frame import Recording
@@ -26,7 +29,7 @@ RUNS: dict[str, tuple[dict[str, Any], int]] = {  # arguments of replay(), and bu
     "candidates, one node": (CANDIDATES | {"single": True, "processes": True}, 0),
     "fused, a process per node": (FUSED | {"processes": True}, 0),
     "fused, one process": (FUSED | {"processes": False}, 0),
-    "fused, one process beside a busy one": (FUSED | {"processes": False}, 1),
+    "fused, one process, one other busy": (FUSED | {"processes": False}, 1),
 }
 
 
@@ -55,6 +58,18 @@ def measure_graph(recording: Recording) -> dict[str, dict]:
                 "speed": 1 / content["slower"], "load": load,
                 "cpu_ms": sum(content["cpu_ms_by_process"].values())}
     return runs
+
+
+@contextmanager
+def run_busy_processes(count: int) -> Iterator[None]:
+    """Run `count` processes that each keep one core busy."""
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in others:
+            process.kill()
+            process.wait()
 
 
 def print_graph(content: dict[str, dict]) -> None:

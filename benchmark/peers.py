@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
-from unittest import mock
 
 import numpy as np
 
@@ -82,37 +81,19 @@ def by_bands(run: Callable, xyz: np.ndarray, params: DbscanParams = DbscanParams
     return labels
 
 
-# RANSAC: points (N, 3), those among them to look in (N,) bool -> mask (N,), plane [a b c], trials.
+# RANSAC: points (N, 3), mask (N,) of the low ones to fit a plane to -> mask (N,) of the ground.
 
-TRIALS = 2000  # at most, as paper A has it
+TRIALS = 2000  # maximum, as in paper A
 
 
-def ransac(xyz: np.ndarray, low: np.ndarray, **settings) -> tuple[np.ndarray, np.ndarray, int]:
-    """Segment ground by scikit-learn's RANSACRegressor with paper A's parameters."""
+def _ransac(xyz: np.ndarray, low: np.ndarray) -> np.ndarray:
     from sklearn.linear_model import LinearRegression, RANSACRegressor
     found = RANSACRegressor(LinearRegression(), max_trials=TRIALS, residual_threshold=0.1,
-                            random_state=0, **settings).fit(xyz[low, :2], xyz[low, 2])
-    mask = np.abs(xyz[:, 2] - found.predict(xyz[:, :2])) <= 0.1
-    line = found.estimator_
-    return mask, np.array([*line.coef_, line.intercept_], np.float64), found.n_trials_
+                            random_state=0).fit(xyz[low, :2], xyz[low, 2])
+    return np.abs(xyz[:, 2] - found.predict(xyz[:, :2])) <= 0.1
 
 
-def ransac_without_stop(xyz: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Run all 2000 trials.
-
-    stop_probability=1.0 does not do that: it is clipped by the rounding error to about 100 trials,
-    so the stop is patched out.
-    """
-    with mock.patch("sklearn.linear_model._ransac._dynamic_max_trials",
-                    lambda *_: float("inf"), create=True):
-        return ransac(xyz, low)
-
-
-RANSACS = (
-    Peer("scikit-learn, own stop", "scikit-learn", "sklearn", ransac),
-    Peer("scikit-learn, stop at 1.0", "scikit-learn", "sklearn",
-         lambda xyz, low: ransac(xyz, low, stop_probability=1.0)))
-RANSAC_2000 = Peer("scikit-learn, 2000 trials", "scikit-learn", "sklearn", ransac_without_stop)
+RANSAC = Peer("scikit-learn's RANSAC", "scikit-learn", "sklearn", _ransac)
 
 
 # Ground. Both print on file descriptor 1.

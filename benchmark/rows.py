@@ -86,21 +86,5 @@ def print_ground(content: dict) -> None:
     console.print(table)
 
 
-def print_planes(content: dict) -> None:
-    """Print the differences between scikit-learn's planes and ours."""
-    table = Table(title="scikit-learn's plane and ours: median (max); the number of frames in "
-                        "which ours : its has more inliers")
-    for name in ("scikit-learn", "trials", "plane", "cm", "degrees", "more inliers"):
-        table.add_column(name, justify="left" if name in ("scikit-learn", "plane") else "right")
-    for name, planes in content["planes"].items():
-        for i, (how, d) in enumerate(planes["difference"].items()):
-            table.add_row(*((name.split(", ")[1], f"{planes['trials']:.0f}") if i == 0
-                            else ("", "")), how,
-                          f"{d['height_cm']['median']:.2f} ({d['height_cm']['max']:.2f})",
-                          f"{d['angle_deg']['median']:.3f} ({d['angle_deg']['max']:.3f})",
-                          f"{d['ours_more']} : {d['its_more']}")
-    console.print(table)
-
-
 def _ms(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}" if value < 100 else f"{value:.0f}"

@@ -67,17 +67,10 @@ def test_a_recording_with_track_ids_is_tracked_by_both_and_one_without_by_none(m
     assert tracking.measure_recording(recording("0000", {})) == {}
 
 
-def test_intervals_of_drives_are_paired_and_precision_is_that_of_the_best_scores():
+def test_intervals_of_drives_are_paired():
     from benchmark.drives import _interval, resample
-    from benchmark.precision import Curve, compute_precisions
     values = [1.0, 2.0, 4.0]
     means = resample(values, lambda chosen: sum(chosen) / 3)
     np.testing.assert_array_equal(means, resample(values, lambda chosen: sum(chosen) / 3))
     low, high = _interval(means)
     assert 1.0 <= low < np.mean(values) < high <= 4.0
-    good = Curve(np.array([0.9, 0.8, 0.2]), np.array([True, False, True]), 4)
-    bad = Curve(np.array([0.95, 0.5]), np.array([False, False]), 0)
-    found = compute_precisions(
-        [good, bad], [0.25, 0.5, 0.75], np.array([[1, 0], [2, 0], [1, 1], [0, 1]])
-    )
-    np.testing.assert_allclose(found, [[1, 2 / 3, 0], [1, 2 / 3, 0], [1 / 2, 2 / 5, 0], [0, 0, 0]])
