@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 EXPERIMENTS = {  # name -> module:attribute of an Experiment; the first is the default
     "stm-cpa": "experiments.stm_cpa.experiment:STM_CPA",
     "stm-cpa-configurations": "experiments.stm_cpa.configurations:CONFIGURATIONS",
+    "clusters": "experiments.clusters.experiment:CLUSTERS",
 }
 
 
@@ -50,8 +51,9 @@ def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out
               jobs: int | None, dask: str | None, limit: int | None, force: bool) -> None:
     """Run an experiment of a paper and report each value next to the paper's.
 
-    EXPERIMENT is stm-cpa (default: every table of the STM-CPA paper) or stm-cpa-configurations
-    (the configurations `paper` and `best`, with and without a labelled seed).
+    EXPERIMENT is stm-cpa (default: every table of the STM-CPA paper), stm-cpa-configurations
+    (the configurations `paper` and `best`, with and without a labelled seed) or clusters (adaptive
+    clustering and improved PointNet).
 
     FOLDER gets report.html, report.md, report.json, the tables as CSV and the figures as PNG, and
     frames.jsonl with the record of every frame. Workers of --dask need this checkout in their

@@ -57,6 +57,43 @@ def bootstrap(counts: np.ndarray, compute: Callable[[np.ndarray], np.ndarray],
     return np.stack([value, *np.where(np.isnan(value), np.nan, limits)])
 
 
+def compute_paired_p(counts: np.ndarray, compute: Callable[[np.ndarray], np.ndarray],
+                     params: BootstrapParams = BootstrapParams()) -> np.ndarray:
+    """Return p values of the differences between two methods on the same frames.
+
+    A paired permutation test: under the hypothesis that the methods are equal, the counts of each
+    frame may be swapped. p is the share of random swaps, and of the counts as they are, with a
+    difference at least as large in absolute value (Phipson and Smyth, 2010).
+
+    Args:
+        counts: (F, 2, *C) counts of both methods.
+        compute: see bootstrap().
+
+    Returns:
+        (*V) float64; NaN where a value has no cases, and without frames.
+    """
+    counts = np.asarray(counts, np.float64)
+    frames, shape = len(counts), counts.shape[2:]
+    flat = counts.reshape(frames, 2, int(np.prod(shape)))
+    total, change = flat.sum(axis=(0, 1)), flat[:, 0] - flat[:, 1]
+
+    def difference(first: np.ndarray) -> np.ndarray:
+        rows = first.shape[:-1]
+        return compute(first.reshape(*rows, *shape)) - compute(
+            (total - first).reshape(*rows, *shape))
+
+    observed = np.abs(difference(flat[:, 0].sum(axis=0)))
+    if frames == 0:
+        return np.full(observed.shape, np.nan)
+    rng, above = np.random.default_rng(params.seed), np.ones(observed.shape)
+    step = max(1, MAX_DRAWS // frames)
+    for first in range(0, params.replicates, step):
+        swapped = rng.random((min(step, params.replicates - first), frames)) < 0.5
+        found = np.abs(difference(flat[:, 0].sum(axis=0) - swapped @ change))
+        above += (found >= observed - 1e-12).sum(axis=0)
+    return np.where(np.isnan(observed), np.nan, above / (params.replicates + 1))
+
+
 def _compute_limits(replicates: np.ndarray, level: float) -> np.ndarray:
     """Return the ends (2, *V) of the interval of replicates (R, *V); NaN where all are NaN."""
     empty = np.isnan(replicates).all(axis=0)

@@ -35,7 +35,8 @@ def mean_neighbourhood_size(cells: Cells) -> float:
 
 
 # S points that represent the points of C cells: xyz (3, S) float64, start (C + 1,) the first of
-# each cell, and weight (C,) the number of points that each of them represents.
+# each cell, and weight (C,) the number of points that each of them represents. If the cells' xyz
+# has more rows, values of the points, then so has the sample's.
 Sample = namedtuple("Sample", "xyz start weight")
 
 
@@ -52,7 +53,7 @@ def sample_cells(cells: Cells, work: int) -> Sample:
         limit //= 2
     kept = np.minimum(sizes, limit)
     start = np.concatenate([[0], np.cumsum(kept)])
-    bits = cells.xyz.astype(np.float32).view(np.uint32).astype(np.uint64)
+    bits = cells.xyz[:3].astype(np.float32).view(np.uint32).astype(np.uint64)
     return Sample(_take_sample(cells, _mix_bits(bits), start), start, sizes / kept)
 
 
@@ -80,7 +81,7 @@ def _count_distances(cells, kept):
 
 @njit(cache=True, nogil=True)
 def _take_sample(cells, keys, start):
-    out = np.empty((3, start[-1]))
+    out = np.empty((len(cells.xyz), start[-1]))
     for a in range(len(start) - 1):
         first = cells.start[a]
         rows = np.argsort(keys[first:cells.start[a + 1]], kind="mergesort")
@@ -92,11 +93,11 @@ def _take_sample(cells, keys, start):
 
 @njit(cache=True, nogil=True)
 def gather_sample(cells, sample, a):
-    """Return the sample of the cells around cell a: xyz (3, M) and weight (M,)."""
+    """Return the sample of the cells around cell a: xyz (3 or more, M) and weight (M,)."""
     size = 0
     for k in range(cells.ranges[a]):
         size += sample.start[cells.high[a, k]] - sample.start[cells.low[a, k]]
-    near, weight, put = np.empty((3, size)), np.empty(size), 0
+    near, weight, put = np.empty((len(sample.xyz), size)), np.empty(size), 0
     for k in range(cells.ranges[a]):
         for b in range(cells.low[a, k], cells.high[a, k]):
             for j in range(sample.start[b], sample.start[b + 1]):

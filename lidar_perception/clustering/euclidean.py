@@ -1,6 +1,8 @@
-"""Adaptive Euclidean clustering (paper C: Zhang et al., PLOS One 2026, e0348581, Eq. 6 to 11).
+"""Adaptive Euclidean clustering (paper C: Zhang et al., PLOS One 2026, e0348581).
 
-The text of the paper lacks the equations. This is our reading of its description:
+It implements Eq. 6 to 9 and 11. Eq. 10, an objective with a regularizer, is what the paper says the
+method minimises; no step of it uses it. The text of the paper lacks the equations. This is our
+reading of its description:
 
 - Threshold d_i of point i. global: alpha times the mean distance of all N points to their nearest
   neighbour (Eq. 6). local: alpha times the mean distance to the other points within `radius`
@@ -11,6 +13,7 @@ The text of the paper lacks the equations. This is our reading of its descriptio
 - Two core points are linked if their distance is within either threshold (Eq. 8). Clusters are the
   connected sets. Any other point joins the nearest core point whose threshold reaches it (of
   equally near ones that with the least x, then y, then z); without one it is in no cluster.
+- With `curvature`, core points on uneven surfaces are taken for other points, see curvature.py.
 - Clusters of fewer than min_size points are dropped. Then clusters are merged whose centres (means)
   are nearer than gamma (D_i + D_j) / 2, where D is the diagonal of the axis-aligned box (Eq. 9).
   All pairs are compared as they are before merging, and chains merge.
@@ -39,6 +42,7 @@ from lidar_perception.clustering.cells import (
     sample_cells,
     sort_into_cells,
 )
+from lidar_perception.clustering.curvature import find_consistent_points
 from lidar_perception.clustering.grid import number_clusters
 from lidar_perception.clustering.params import EuclideanParams
 from lidar_perception.clustering.thinning import (
@@ -83,28 +87,32 @@ def cluster_euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams
     if n == 0:
         return np.zeros(0, np.int32)
     xyz = np.ascontiguousarray(xyz, np.float32)
+    radii, max_work = (np.full(n, params.radius) if radii is None else radii,
+                       min(max_work, MAX_WORK_PER_POINT * n))
     if params.threshold == "global":
         mean, cells = _mean_nearest_distance(xyz, max_distances)
         reach = np.full(n, np.float32(params.alpha * mean), np.float64)
     elif params.threshold == "fixed":
         cells, reach = sort_into_cells(xyz, params.distance), np.full(n, params.distance)
     else:
-        radii = np.full(n, params.radius) if radii is None else radii
         cells, reach = sort_into_cells(xyz, float(radii.max())), np.empty(n)
-        radii2, work = radii[cells.order] ** 2, min(max_work, MAX_WORK_PER_POINT * n)
-        means = (_mean_distances(cells, radii2) if mean_neighbourhood_size(cells) * n <= work else
-                 _mean_distances_to_sample(cells, sample_cells(cells, work), radii2))
+        radii2, exact = radii[cells.order] ** 2, mean_neighbourhood_size(cells) * n <= max_work
+        means = (_mean_distances(cells, radii2) if exact else
+                 _mean_distances_to_sample(cells, sample_cells(cells, max_work), radii2))
         reach[cells.order] = np.float32(params.alpha * means)
     if reach.max() > cells.reach:
         cells = sort_into_cells(xyz, reach.max())
     component, min_points = np.empty(n, np.int32), params.beta * np.log(n)
+    growing = (find_consistent_points(xyz, radii, params.curvature, max_work)
+               if params.curvature else np.ones(n, bool))
     reach2 = reach[cells.order] ** 2
     is_core, left = find_core_points(cells, reach2, min_points, float(max_distances * n))
     component[cells.order], left = _find_components(
-        cells, np.stack([*cells.xyz, reach2], axis=1), is_core, left)
+        cells, np.stack([*cells.xyz, reach2], axis=1), is_core & growing[cells.order], left)
     if left < 0:
         tree = build_tree(xyz)
-        component[tree.order] = _find_components_by_tree(tree, reach[tree.order] ** 2, min_points)
+        component[tree.order] = _find_components_by_tree(tree, reach[tree.order] ** 2, min_points,
+                                                         growing[tree.order])
     size = np.bincount(component + 1)  # size[0] counts the points without a component
     kept = (component >= 0) & (size[component + 1] >= params.min_size)
     parent, indices = np.arange(len(size), dtype=np.int32), np.arange(n)
@@ -226,9 +234,10 @@ def _mean_distances_to_sample(cells, sample, radii2):
     return means
 
 
-def _find_components_by_tree(tree: Tree, reach2: np.ndarray, min_points: float) -> np.ndarray:
+def _find_components_by_tree(tree: Tree, reach2: np.ndarray, min_points: float,
+                             growing: np.ndarray) -> np.ndarray:
     """Return the result of _find_components in the order of the tree."""
-    is_core = find_core_points_in_tree(tree, reach2, min_points)[0]
+    is_core = find_core_points_in_tree(tree, reach2, min_points)[0] & growing
     max_work = max_exact_distances(len(is_core))
     component, work = find_components(tree, reach2, is_core, 0.0, max_work)
     if work > max_work:

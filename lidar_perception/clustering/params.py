@@ -34,7 +34,7 @@ class DbscanParams(Params):
 
 @dataclass(frozen=True)
 class EuclideanParams(Params):
-    """Adaptive Euclidean clustering (paper C, Eq. 6 to 11)."""
+    """Adaptive Euclidean clustering (paper C, Eq. 6 to 9 and 11)."""
 
     threshold: str = param("local", "global: one distance for the whole cloud (Eq. 6). local: "
                            "one for each point, from its neighbours (Eq. 11). fixed: `distance`.",
@@ -51,6 +51,9 @@ class EuclideanParams(Params):
     radius: float = param(0.5, "Radius of the neighbourhood for the local threshold.", unit="m",
                           low=0.001, high=10.0)
     min_size: int = param(10, "Smaller clusters are dropped.", low=1, high=MAX_INT)
+    curvature: float = param(0.0, "Curvature-consistent growing: clusters grow only from points "
+                             "whose surface variation (0 to 1/3) is within this of the mean within "
+                             "`radius`; 0: from all core points.", low=0.0, high=1.0)
 
 
 CLUSTERING_METHODS = ("dbscan", "euclidean")

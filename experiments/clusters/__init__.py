@@ -1,0 +1,1 @@
+"""The tables of paper C: adaptive Euclidean clustering and the improved PointNet."""
