@@ -1,8 +1,8 @@
-"""The actions of a labelling session: apply(state, action, motion) returns the next state.
+"""Actions of a labelling session: apply(state, action, motion) returns the next state.
 
-An action is a dict like a line of the journal, including everything that was computed for it, so
-replaying a journal gives the same state and needs no detector. The tracks in an action are Track
-objects; decode_action() and encode_action() convert from and to a line of the journal.
+An action is a dict like a line of the journal. It contains all computed values, so a journal can be
+replayed without a detector. Its tracks are Track objects; decode_action() and encode_action()
+convert from and to a line of the journal.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from lidar_studio.state import (
 Action = Mapping[str, Any]
 TrackChanges = dict[int, Track | None]  # None: the track is removed
 MAX_CLASS_LENGTH = 100                  # characters
-WITH_TRACKS = "seed", "propose", "import"  # actions whose `tracks` are computed; merge has ids
+WITH_TRACKS = "seed", "propose", "import"  # actions with tracks; `tracks` of merge are ids
 
 
 def decode_action(line: Action) -> Action:
@@ -53,8 +53,7 @@ def _convert_tracks(action: Action, convert: Callable[[Any], Any]) -> Action:
 
 
 def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
-    """Return the next state and the change. InputError with a one-line message for an invalid
-    action."""
+    """Return the next state and the change. InputError for an invalid action."""
     name, motion = action.get("do"), with_scan_poses(state, motion)
     if name == "poses":  # not an edit of a person, so not undoable
         poses = tuple(tuple(map(float, row)) for row in action["poses"])
@@ -83,7 +82,7 @@ def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
 
 
 def with_scan_poses(state: State, motion: Motion) -> Motion:
-    """Return the motion of a drive; if it has no poses, with those from scan matching."""
+    """Return the motion of a drive, with the poses from scan matching if it has no others."""
     if motion.poses is not None or len(state.poses) != len(motion.times):
         return motion
     return Motion(motion.times, np.array(state.poses, np.float64).reshape(-1, 4, 4))
@@ -148,7 +147,7 @@ def require_numbers(action: Action, name: str, count: int) -> tuple[float, ...]:
 
 
 def require_positive(values: tuple[float, ...]) -> tuple[float, ...]:
-    """Return length, width and height unchanged. InputError unless all are above 0."""
+    """Return length, width and height. InputError unless all are above 0."""
     if min(values) <= 0:
         raise InputError(f"length, width and height must be above 0, not {list(values)}")
     return values
@@ -162,7 +161,7 @@ def require_box_values(action: Action) -> tuple[float, ...]:
 
 
 def require_class_name(action: Action) -> str:
-    """Return the class name in an action; any short text is valid, else InputError."""
+    """Return the class name in an action. InputError if it is empty, too long or not a text."""
     name = action.get("class")
     if not isinstance(name, str) or not name.strip() or len(name) > MAX_CLASS_LENGTH:
         raise InputError(f"a class is a name of up to {MAX_CLASS_LENGTH} characters, not "
@@ -183,12 +182,12 @@ def _replace_computed(state: State, action: Action, motion: Motion) -> Outcome:
 def _seed(state: State, action: Action, motion: Motion) -> Outcome:
     frame, own = require_frame(action, motion), action.get("track")
     if not isinstance(own, int):
-        raise InputError("a seed needs its track; the server finds it")
+        raise InputError("a seed needs its track, which the server computes")
     return _computed_tracks(state, action), add_seed(state.seeds, frame, own), state.checked
 
 
 def add_seed(seeds: Seeds, frame: int, track: int) -> Seeds:
-    """Return the seeds with (frame, track), once."""
+    """Add (frame, track) to the seeds unless it is one of them."""
     return seeds if (frame, track) in seeds else (*seeds, (frame, track))
 
 
@@ -200,9 +199,9 @@ def _add(state: State, action: Action, motion: Motion) -> Outcome:
 
 def _box(state: State, action: Action, motion: Motion) -> Outcome:
     track, frame = require_track(state, action.get("track")), require_frame(action, motion)
-    gone = track.gone - {frame}
-    boxes = apply_correction(track.boxes, gone, frame, require_box_values(action), motion)
-    return _replace(state, replace(track, boxes=boxes, gone=gone))
+    removed = track.removed_frames - {frame}
+    boxes = apply_correction(track.boxes, removed, frame, require_box_values(action), motion)
+    return _replace(state, replace(track, boxes=boxes, removed_frames=removed))
 
 
 def _size(state: State, action: Action, motion: Motion) -> Outcome:
@@ -221,16 +220,17 @@ def _remove_box(state: State, action: Action, motion: Motion) -> Outcome:
     boxes = {f: b for f, b in track.boxes.items() if f != frame}
     if not boxes:
         return {track.id: None}, _drop_seeds(state.seeds, track.id), state.checked
-    return _replace(state, replace(track, boxes=boxes, gone=track.gone | {frame}))
+    removed = track.removed_frames | {frame}
+    return _replace(state, replace(track, boxes=boxes, removed_frames=removed))
 
 
 def _interpolate(state: State, action: Action, motion: Motion) -> Outcome:
     track, frame = require_track(state, action.get("track")), require_frame(action, motion)
-    gone = track.gone - {frame}
-    boxes = reinterpolate_frame(track.boxes, gone, frame, motion)
+    removed = track.removed_frames - {frame}
+    boxes = reinterpolate_frame(track.boxes, removed, frame, motion)
     if boxes is None:
         raise InputError(f"track {track.id} has no key box on both sides of frame {frame}")
-    return _replace(state, replace(track, boxes=boxes, gone=gone))
+    return _replace(state, replace(track, boxes=boxes, removed_frames=removed))
 
 
 def _drop_seeds(seeds: Seeds, track: int) -> Seeds:
@@ -284,11 +284,11 @@ def _merge(state: State, action: Action, motion: Motion) -> Outcome:
     boxes = {**second.boxes, **first.boxes}
     boxes |= {f: b for f, b in second.boxes.items()
               if b.kind == KEY and boxes[f].kind != KEY}
-    gone = (first.gone | second.gone) - boxes.keys()
-    merge_proposals = replace(first, boxes=boxes, gone=gone, extra={**second.extra, **first.extra},
-                              edited=True, nearby=False)
+    removed = (first.removed_frames | second.removed_frames) - boxes.keys()
+    merged = replace(first, boxes=boxes, removed_frames=removed,
+                     extra={**second.extra, **first.extra}, edited=True, nearby=False)
     seeds = tuple(dict.fromkeys((f, first.id if t == second.id else t) for f, t in state.seeds))
-    return {first.id: merge_proposals, second.id: None}, seeds, state.checked
+    return {first.id: merged, second.id: None}, seeds, state.checked
 
 
 def _split(state: State, action: Action, motion: Motion) -> Outcome:
@@ -300,7 +300,8 @@ def _split(state: State, action: Action, motion: Motion) -> Outcome:
 
     def part(frames: set[int], number: int, after: bool) -> Track:
         return replace(track, id=number, boxes={f: track.boxes[f] for f in sorted(frames)},
-                       gone=frozenset(f for f in track.gone if (f >= frame) == after),
+                       removed_frames=frozenset(
+                           f for f in track.removed_frames if (f >= frame) == after),
                        extra={f: v for f, v in track.extra.items() if (f >= frame) == after},
                        edited=True, nearby=False)
     new = state.next_id
@@ -322,8 +323,9 @@ def _trim(state: State, action: Action, motion: Motion) -> Outcome:
         raise InputError(f"track {track.id} has {'no' if kept else 'only'} boxes {side} frame "
                          f"{frame}")
     seeds = tuple(s for s in state.seeds if s[1] != track.id or s[0] not in cut)
-    gone = track.gone | (beyond if track.nearby else cut)  # tracking may still reach there
-    return ({track.id: replace(track, boxes=kept, gone=gone)}, seeds, state.checked)
+    # Tracking may still reach frames that have no box yet.
+    removed = track.removed_frames | (beyond if track.nearby else cut)
+    return ({track.id: replace(track, boxes=kept, removed_frames=removed)}, seeds, state.checked)
 
 
 def _check(state: State, action: Action, motion: Motion) -> Outcome:

@@ -1,4 +1,4 @@
-"""A drive to label: its frames, the sensor's poses, and a cache of segmented clouds."""
+"""A drive to label or view: its frames, sensor poses, and a cache of segmented clouds."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ MAX_CACHE_BYTES = 200 * 10**6
 MAGIC = b"LPC1"
 COLORS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#cc79a7", "#0072b2", "#d55e00", "#999999",
           "#666666")  # colour-blind safe palette of Okabe and Ito, and two greys
-DEFAULT_SIZE_M = (1.0, 1.0, 1.0)  # new box of a class without a usual size
+DEFAULT_SIZE_M = (1.0, 1.0, 1.0)  # of a new box whose class has no usual size
 
 
 @dataclass(frozen=True)
 class Scan:
-    """A segmented cloud, its points in a fixed random order: the first ones are a thinned cloud.
+    """A segmented cloud. The points are in random order, so that the first ones are a sample.
 
     xyz (N, 3) float32 in metres, intensity (N,) uint8, ground (N,) bool, cluster_ids (N,) int32
     with 0 for no cluster.
@@ -47,7 +47,7 @@ class Scan:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the arrays, in bytes."""
+        """Size of the arrays in bytes."""
         return sum(a.nbytes for a in (self.xyz, self.intensity, self.ground, self.cluster_ids))
 
     def encode(self) -> bytes:
@@ -59,7 +59,7 @@ class Scan:
 
 
 def make_pipeline_params(frame: Frame) -> PipelineParams:
-    """Return the `best` configuration without a field of view, at the frame's sensor height."""
+    """Return the configuration `best` for all directions and the frame's sensor height."""
     return with_values(BEST, {"view.enabled": False,
                               "ground.sensor_pose.height": frame.sensor_height})
 
@@ -72,7 +72,7 @@ def segment_frame(frame: Frame) -> Scan:
 
 
 def to_scan(cloud: PointCloud, ground: Array, cluster_ids: Array) -> Scan:
-    """Make the scan of a cloud of N points with ground (N,) bool and cluster_ids (N,) int."""
+    """Make the scan of N points with ground (N,) bool and cluster_ids (N,) int."""
     order = np.random.default_rng(0).permutation(len(cloud))
     intensity = np.zeros(len(cloud)) if cloud.intensity is None else cloud.intensity
     shown = np.nan_to_num(np.clip(intensity, 0.0, 1.0)) * 255
@@ -81,7 +81,7 @@ def to_scan(cloud: PointCloud, ground: Array, cluster_ids: Array) -> Scan:
 
 
 class ScanCache:
-    """Thread-safe LRU cache of scans, of up to `limit` bytes; concurrent calls make a scan once."""
+    """Thread-safe LRU cache of scans, up to `limit` bytes; a scan is never made twice at once."""
 
     def __init__(self, make: Callable[[int], Scan], limit: int = MAX_CACHE_BYTES) -> None:
         self._make, self._limit, self._size = make, limit, 0
@@ -111,7 +111,10 @@ class ScanCache:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A recording of one sequence. scan: makes the scan of a frame, by default by segmenting it."""
+    """A recording of one sequence.
+
+    scan: makes the scan of a frame; by default it segments the cloud.
+    """
 
     name: str
     recording: Recording
@@ -119,7 +122,7 @@ class Drive:
 
     @cached_property
     def frames(self) -> list[Frame]:
-        """All frames, in order of time."""
+        """The frames in order of time."""
         return list(self.recording.frames)
 
     @property
@@ -134,8 +137,8 @@ class Drive:
 
     @cached_property
     def journal_header(self) -> dict[str, Any]:
-        """Header of the drive's journal, with a digest of the first and last cloud ("" if they
-        cannot be read)."""
+        """Header of the drive's journal, with a digest of the first and last cloud, or "" if they
+        cannot be read."""
         try:
             clouds = b"".join(self.frames[i].load().xyz.tobytes() for i in (0, -1))
         except InputError:
@@ -157,7 +160,7 @@ class Drive:
 
     @cached_property
     def load_scan(self) -> ScanCache:
-        """Function from the index of a frame to its scan, which is cached."""
+        """Cached function that returns the scan of a frame by its index."""
         return ScanCache(lambda i: self.scan(self.frames[i]))
 
 
@@ -184,7 +187,7 @@ def select_drive(recording: Recording, sequence: str | None = None) -> Drive:
 
 
 def require_clouds(drive: Drive) -> None:
-    """Raise the first frame's InputError if the first, middle and last cloud are all unreadable."""
+    """Raise InputError if the first, middle and last cloud are all unreadable."""
     problems: list[InputError] = []
     for i in sorted({0, len(drive.frames) // 2, len(drive.frames) - 1}):
         try:
@@ -196,7 +199,7 @@ def require_clouds(drive: Drive) -> None:
 
 
 def list_classes() -> list[dict[str, Any]]:
-    """List the classes that the page offers: name, usual size, colour."""
+    """Return the classes of the page: name, usual size, colour."""
     named = [row for row in TABLE if row.name != "DontCare"]
     return [{"name": row.name, "color": color,
              "size": list(row.numbers.mean_size if row.numbers else DEFAULT_SIZE_M)}

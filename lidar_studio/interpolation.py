@@ -21,15 +21,18 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Motion of the sensor: times (F,) float64 in seconds, increasing; poses (F, 4, 4) in a fixed
-    frame, None if unknown."""
+    """Motion of the sensor in F frames.
+
+    times: (F,) float64 in seconds, increasing.
+    poses: (F, 4, 4) in a fixed frame; None if unknown.
+    """
 
     times: Array
     poses: Array | None = None
 
     @staticmethod
     def of(stamps_ns: Array, poses: Array | None = None) -> Motion:
-        """Make it from stamps (F,) int; if they do not increase, frames are 0.1 s apart."""
+        """Make a Motion from stamps (F,) int; frames are 0.1 s apart if stamps do not increase."""
         times = (stamps_ns - stamps_ns[0]) / 1e9 if len(stamps_ns) else np.zeros(0)
         if (np.diff(times) <= 0).any():
             times = np.arange(len(times)) * 0.1
@@ -46,7 +49,7 @@ class Motion:
             box, invert_pose(self.poses[frame]))[0]
 
     def carry_box(self, values: Array | tuple[float, ...], frm: int, to: int) -> Array:
-        """Return a box (7,) of one frame as seen in another, if the object stands still."""
+        """Move a box (7,) of a stationary object from one frame to another."""
         return self.to_sensor(self.to_fixed(values, frm), to)
 
 
@@ -57,14 +60,13 @@ def interpolate_box(first: Array, last: Array, share: float) -> Array:
     return box
 
 
-def apply_correction(boxes: Mapping[int, Box], gone: frozenset[int], frame: int,
+def apply_correction(boxes: Mapping[int, Box], removed: frozenset[int], frame: int,
                      values: tuple[float, ...], motion: Motion) -> dict[int, Box]:
-    """Return the boxes of a track after a person set the box of a frame, now a key box.
+    """Set the key box of a frame, and adjust the other boxes of the track.
 
-    Up to the next key box on each side, boxes move by a share of the correction that falls
-    linearly with time to zero at that key box, and frames without a box get an interpolated one.
-    Beyond the outermost key box, boxes take the whole correction and the new size. Other key boxes
-    do not move, and frames in `gone` stay empty.
+    Up to the next key box on each side, the correction fades linearly with time, and frames without
+    a box get an interpolated one. If there is no key box on a side, all boxes there take the whole
+    correction and the new size. Frames in `removed` stay empty.
     """
     found = dict(boxes)
     found[frame] = Box(values, KEY)
@@ -82,10 +84,10 @@ def apply_correction(boxes: Mapping[int, Box], gone: frozenset[int], frame: int,
                 moved[3:6], moved[6] = new[3:6], wrap_angle(moved[6])
                 found[f] = Box.of(motion.to_sensor(moved, f), boxes[f].kind)
             if side and (near := min(side, key=lambda f: abs(f - frame))) != frame + step:
-                _fill_gap(found, gone, near, frame, motion)
+                _fill_gap(found, removed, near, frame, motion)
         else:
             _distribute_correction(found, stop, frame, new, change, motion)
-            _fill_gap(found, gone, stop, frame, motion)
+            _fill_gap(found, removed, stop, frame, motion)
     return found
 
 
@@ -110,8 +112,8 @@ def _interpolate_between(boxes: Mapping[int, Box], a: int, b: int, frame: int,
 
 def _distribute_correction(found: dict[int, Box], stop: int, frame: int, new: Array, change: Array,
                            motion: Motion) -> None:
-    """Move the boxes between the key boxes of `stop` and `frame` by their shares of a change; flip
-    headings that oppose those of the key boxes."""
+    """Move the boxes between the key boxes of `stop` and `frame` by their shares of a change, and
+    flip opposite headings."""
     fixed = motion.to_fixed(found[stop].values, stop)
     turn = wrap_line(change[6])
     for f in [f for f in found if min(stop, frame) < f < max(stop, frame)]:
@@ -127,21 +129,21 @@ def _distribute_correction(found: dict[int, Box], stop: int, frame: int, new: Ar
         found[f] = Box.of(motion.to_sensor(moved, f), INTERPOLATED)
 
 
-def _fill_gap(found: dict[int, Box], gone: frozenset[int], a: int, b: int, motion: Motion) -> None:
-    """Interpolate a box for every frame between a and b that has none and is not in `gone`."""
+def _fill_gap(found: dict[int, Box], removed: frozenset[int], a: int, b: int,
+              motion: Motion) -> None:
     frames = sorted(f for f in found if min(a, b) <= f <= max(a, b))
     for first, last in pairwise(frames):
         for f in range(first + 1, last):
-            if f not in gone:
+            if f not in removed:
                 box = _interpolate_between(found, first, last, f, motion)
                 found[f] = Box.of(motion.to_sensor(box, f), INTERPOLATED)
 
 
-def reinterpolate_frame(boxes: Mapping[int, Box], gone: frozenset[int], frame: int,
+def reinterpolate_frame(boxes: Mapping[int, Box], removed: frozenset[int], frame: int,
                         motion: Motion) -> dict[int, Box] | None:
-    """Interpolate the boxes between the key boxes around `frame`, except in frames in `gone`.
+    """Interpolate the boxes between the key boxes around `frame`, except in `removed` frames.
 
-    Return None if there is no key box on one of the sides.
+    Return None if one of the two key boxes is missing.
     """
     keys = [f for f, box in boxes.items() if box.kind == KEY and f != frame]
     before = max((f for f in keys if f < frame), default=None)
@@ -149,7 +151,7 @@ def reinterpolate_frame(boxes: Mapping[int, Box], gone: frozenset[int], frame: i
     if before is None or after is None:
         return None
     found = {f: box for f, box in boxes.items() if not before < f < after}
-    _fill_gap(found, gone, before, after, motion)
+    _fill_gap(found, removed, before, after, motion)
     return dict(sorted(found.items()))
 
 

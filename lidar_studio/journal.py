@@ -1,7 +1,7 @@
 """Journal file of a labelling session: every action is on disk before it takes effect.
 
-A killed process loses at most a half-written last line. The first line identifies the drive; each
-further line is one action with its number.
+If the process is killed, only an incomplete last line is lost. The first line identifies the drive;
+each further line is a numbered action.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ def make_journal_header(drive: str, names: Sequence[str], stamps_ns: Sequence[in
     """Make the first line of a journal, which identifies the drive by its frames.
 
     Args:
-        drive: name of the drive; it may differ if `clouds` is the same.
+        drive: name of the drive; ignored when comparing if `clouds` is the same.
         clouds: digest of some of the clouds, "" if unknown.
-        posed: True if the drive has poses of the sensor.
+        posed: True if the drive has sensor poses.
     """
     stamps = hashlib.sha256(" ".join(map(str, stamps_ns)).encode()).hexdigest()[:16]
     return {"journal": VERSION, "drive": drive, "frames": len(names),
@@ -40,8 +40,11 @@ def _encode(line: Mapping[str, Any]) -> bytes:
 
 
 class Journal:
-    """The journal of a folder. lines: its actions when it was opened; message: a warning about the
-    file, or None."""
+    """The journal of a folder.
+
+    lines: the actions that it had when it was opened.
+    message: a warning about the file, or None.
+    """
 
     def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
         self.path = folder / JOURNAL_NAME
@@ -65,7 +68,7 @@ class Journal:
             raise
 
     def append(self, line: Mapping[str, Any]) -> None:
-        """Write a line and sync it to disk. InputError if that fails; the file is unchanged."""
+        """Write a line and sync it to disk. InputError if that fails, without changing the file."""
         content, status = _encode(line), os.fstat(self._file)
         if status.st_nlink == 0:  # the data would be lost when this process ends
             raise InputError(f"{self.path} was removed or replaced; nothing was done: export your "
@@ -92,8 +95,11 @@ class Journal:
             os.close(self._file)
 
     def _read_lines(self) -> int:
-        """Read all lines, truncate an incomplete last one, and return the size of the file.
-        InputError for the journal of another drive or a damaged one."""
+        """Read all lines, cut off an incomplete last one, and return the size of the file.
+
+        Raises:
+            InputError: the journal is damaged, or belongs to another drive.
+        """
         with open(self.path, "rb") as stream:
             content = stream.read()
         whole = content.rfind(b"\n") + 1
@@ -127,15 +133,15 @@ class Journal:
 
     def _check_header(self, found: Mapping[str, Any]) -> None:
         expected = dict(self._header)
-        if not found.get("clouds") or not expected["clouds"]:  # an old journal, or broken clouds
+        if not found.get("clouds") or not expected["clouds"]:  # the clouds were unreadable
             expected.pop("clouds")
         elif found["clouds"] == expected["clouds"]:
             expected.pop("drive")
-        posed = expected.pop("posed", None), found.get("posed")  # None in an old journal
+        posed = expected.pop("posed", None), found.get("posed")
         if set(posed) == {True, False}:
             now, then = ("with" if value else "without" for value in posed)
-            raise InputError(f"{self.path} was made {then} poses of the sensor, but the drive is "
-                             f"{now} them now, which would change all interpolated boxes; give the "
+            raise InputError(f"{self.path} was made {then} sensor poses, but the drive is now "
+                             f"{now} them, which would change all interpolated boxes; give the "
                              "drive as it was, or another --out")
         if different := find_differences({k: found.get(k) for k in expected}, expected):
             raise InputError(f"{self.path} is the journal of another drive: "
@@ -143,7 +149,7 @@ class Journal:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Sync the folder, so that the name of a new file is on disk too."""
+    """Sync a folder, so that the name of a new file is on disk too."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -153,8 +159,7 @@ def _sync_folder(folder: Path) -> None:
 
 @contextmanager
 def open_journal(folder: Path, head: Mapping[str, Any]) -> Iterator[Journal]:
-    """Open the journal of a folder; make both if they do not exist. InputError while another
-    process has the folder."""
+    """Open or create the journal of a folder. InputError if another process uses the folder."""
     with lock_folder(folder):
         journal = Journal(folder, head)
         try:

@@ -1,7 +1,7 @@
-"""Conversion between tracks and the labels of a drive that label formats read and write.
+"""Conversion between tracks and the labels of a drive, for import and export.
 
-Fields of a file that tracks do not have are preserved: those of a box in Track.extra, those of a
-frame or of the drive in State.kept.
+Other fields of a file are preserved: those of a box in Track.extra, those of a frame or of the
+drive in State.kept.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ ID, SCORE, REST = "track_id", "score", "rest"  # keys of Track.extra
 
 
 def to_tracks(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str, Any]]:
-    """Make accepted tracks of key boxes, with ids from first_id on, and the value of State.kept.
+    """Convert labels to accepted tracks of key boxes, with ids from first_id on, and State.kept.
 
-    Boxes with the same track id and class form a track; a box without an id is its own track.
+    Boxes with the same track id and class form a track; a box without an id is a track of its own.
     """
     found: dict[tuple[Any, ...], tuple[str, dict[int, Box], dict[int, dict[str, Any]]]] = {}
     for f, frame in enumerate(labels.frames):
@@ -45,13 +45,13 @@ def to_tracks(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str
 
 
 def compute_digest(tracks: Sequence[Track], kept: Kept) -> str:
-    """Compute a digest of the result of to_tracks that does not depend on the ids."""
+    """Compute a digest of the result of to_tracks, independent of the ids."""
     rows = [{**track_to_json(t), "id": 0} for t in tracks]
     return hashlib.sha256(json.dumps([rows, kept], sort_keys=True).encode()).hexdigest()[:16]
 
 
 def join_extras(before: Kept, new: Kept) -> dict[str, Any]:
-    """Combine State.kept with the extras of another import; nothing is lost."""
+    """Merge State.kept with that of another import."""
     notes = {f: list(rows) for f, rows in before.get("notes", {}).items()}
     for f, rows in new["notes"].items():
         known = notes.setdefault(f, [])
@@ -60,8 +60,7 @@ def join_extras(before: Kept, new: Kept) -> dict[str, Any]:
 
 
 def to_labels(state: State, frames: Sequence[Frame]) -> DriveLabels:
-    """Convert the accepted tracks to labels by frame, with the ids they were imported with, if
-    any."""
+    """Convert the accepted tracks to labels by frame, with the ids of imported tracks."""
     ids = _choose_ids(state)
     rows: list[list[tuple[Track, Box, dict[str, Any]]]] = [[] for _ in frames]
     for number in sorted(ids):
@@ -80,7 +79,7 @@ def to_labels(state: State, frames: Sequence[Frame]) -> DriveLabels:
 
 
 def _choose_ids(state: State) -> dict[int, int]:
-    """Choose unique exported ids for the accepted tracks, preferably the imported ones."""
+    """Choose unique ids for the export of the accepted tracks, preferably the imported ones."""
     chosen = [t for t in state.tracks.values() if t.state == ACCEPTED]
     found: dict[int, int] = {}
     used = set[int]()

@@ -1,6 +1,6 @@
-"""The newest frames of a running graph for the page: clouds, with the boxes of the same stamp.
+"""The newest frames of a running graph, for the page: clouds with the boxes of the same stamp.
 
-Independent of ROS: the node in live_view.py passes the messages in.
+Independent of ROS: the node in live_view.py adds the messages.
 """
 
 from __future__ import annotations
@@ -36,70 +36,72 @@ from msg_utils.stamps import to_ns
 Array = np.ndarray[Any, Any]
 BOXES, TRACKS, LABELS = "detections", "tracks", "labels"  # kinds of box topics
 MAX_BYTES, MAX_FRAMES = 300 * 10**6, 300  # of stored clouds: 30 s at 10 Hz
-MAX_WAIT_S = 0.5       # a cloud waits so long for its boxes before it is shown without them
-MAX_EARLY_ARRAYS = 50  # per topic, that wait for their cloud
+MAX_WAIT_S = 0.5       # of a cloud for its boxes; then it is shown without them
+MAX_EARLY_ARRAYS = 50  # per topic
 
 
 @dataclass
 class BoxTopic:
     """A topic with boxes, and its statistics.
 
-    number: among the topics of its kind.
-    late: arrays that arrived after their cloud was shown.
-    unmatched: arrays without a cloud.
-    tf_problem: why its boxes cannot be transformed to the cloud's frame, or "".
-    early: by stamp, arrays whose cloud has not arrived.
-    delays: behind the cloud, in milliseconds.
+    number: index among the topics of its kind.
+    late_count: number of arrays that arrived after their cloud was shown.
+    unmatched_count: number of arrays without a cloud.
+    tf_problem: reason why its boxes cannot be transformed to the cloud's frame, or "".
+    early_arrays: arrays whose cloud has not arrived yet, by stamp.
+    delays: of the last arrays after their clouds, in milliseconds.
     """
 
     kind: str
     number: int
-    received: int = 0
-    late: int = 0
-    unmatched: int = 0
+    received_count: int = 0
+    late_count: int = 0
+    unmatched_count: int = 0
     tf_problem: str = ""
-    early: OrderedDict[int, tuple[Any, Any]] = field(default_factory=OrderedDict)
+    early_arrays: OrderedDict[int, tuple[Any, Any]] = field(default_factory=OrderedDict)
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=50))
 
 
 @dataclass
 class LiveFrame:
-    """A cloud (PointCloud2) with its objects and trails by topic. received: monotonic seconds."""
+    """A cloud (PointCloud2) with its objects and trails by topic.
+
+    received_s: time of arrival on the monotonic clock, in seconds.
+    """
 
     number: int
     stamp_ns: int
     cloud: Any
-    received: float
+    received_s: float
     objects: dict[str, MarkedObjects] = field(default_factory=dict)
     trails: dict[str, dict[int, Array]] = field(default_factory=dict)  # by make_track_id
-    shown: bool = False
+    is_shown: bool = False
 
 
 class LiveGraph:
     """The newest frames of a running graph; thread-safe.
 
-    Frames are numbered in order of arrival. The oldest are dropped beyond max_frames or max_bytes.
+    Frames are numbered in order of arrival. Beyond max_frames or max_bytes, the oldest are dropped.
 
     listeners: called with every event of /api/events.
-    lines: problems with the topics, set by the node.
-    values: reception statistics of the clouds, set by the node.
-    tree: transforms for boxes in other frames than their cloud's; filled by the thread that calls
-        add_cloud() and add_boxes().
+    problems: problems with the topics, set by the node.
+    statistics: reception statistics of the clouds, set by the node.
+    tree: transforms of boxes in other frames; filled by the thread that adds clouds and boxes.
     """
 
     def __init__(self, name: str, max_bytes: int = MAX_BYTES,
                  max_frames: int = MAX_FRAMES) -> None:
         self.name, self.max_bytes, self.max_frames = name, max_bytes, max_frames
         self.listeners: list[Callable[[dict[str, Any]], None]] = []
-        self.lines: list[str] = []
-        self.values: Mapping[str, Any] = {}
+        self.problems: list[str] = []
+        self.statistics: Mapping[str, Any] = {}
         self.topics: dict[str, BoxTopic] = {}
         self.tree = TransformTree()
-        self.skipped = 0         # clouds that arrived while a page was paused
+        self.skipped_count = 0   # clouds that arrived while a page was paused
         self._frames: dict[int, LiveFrame] = {}
         self._by_stamp: dict[int, LiveFrame] = {}
         self._next = self._bytes = 0
-        self._holding: set[int] = set()
+        self._holding_pages: set[int] = set()
         self._awaiting_tf: list[tuple[LiveFrame, str, MarkedObjects, Any]] = []
         self._numbers: dict[tuple[str, str], int] = {}  # BoxTopic.number
         self._last_status: dict[str, Any] = {}
@@ -118,28 +120,28 @@ class LiveGraph:
         return self._next
 
     def set_held(self, page: int, held: bool) -> None:
-        """Hold or release the frames for a page. While held, new clouds are skipped."""
+        """Pause or resume a page. New clouds are skipped while any page is paused."""
         with self._lock:
-            (self._holding.add if held else self._holding.discard)(page)
+            (self._holding_pages.add if held else self._holding_pages.discard)(page)
 
     def expect_topic(self, topic: str, kind: str) -> None:
-        """Expect boxes of a kind on a topic, so that clouds wait for them."""
+        """Add a topic with boxes of a kind, for which clouds wait."""
         with self._lock:
             if topic not in self.topics:
                 number = sum(other_kind == kind for other_kind, _ in self._numbers)
                 self.topics[topic] = BoxTopic(kind, self._numbers.setdefault((kind, topic), number))
 
     def forget_topic(self, topic: str) -> None:
-        """Stop expecting boxes on a topic without publishers."""
+        """Remove a topic, such as one without publishers."""
         with self._lock:
             self.topics.pop(topic, None)
 
     def add_cloud(self, message: Any) -> None:
-        """Add a PointCloud2. Boxes belong to the last cloud of their stamp, as a bag may loop."""
+        """Add a PointCloud2. Boxes belong to the last cloud of their stamp, as bags may loop."""
         with self._lock:
             stamp = to_ns(message.header.stamp)
-            if self._holding:
-                self.skipped += 1
+            if self._holding_pages:
+                self.skipped_count += 1
                 return
             frame = LiveFrame(self._next, stamp, message, monotonic())
             self._frames[self._next] = self._by_stamp[stamp] = frame
@@ -152,38 +154,41 @@ class LiveGraph:
                     del self._by_stamp[old.stamp_ns]
                 self._bytes -= len(old.cloud.data)
             for topic, box_topic in self.topics.items():
-                if stamp in box_topic.early:
-                    self._add_objects(frame, topic, *box_topic.early.pop(stamp))
+                if stamp in box_topic.early_arrays:
+                    self._add_objects(frame, topic, *box_topic.early_arrays.pop(stamp))
         self.update()
 
     def add_boxes(self, topic: str, objects: MarkedObjects, message: Any) -> None:
-        """Add an array of boxes. message: the MarkerArray with trails, or None."""
+        """Add an array of boxes. message: the MarkerArray with their trails, or None."""
         with self._lock:
             if (box_topic := self.topics.get(topic)) is None:
                 return
-            box_topic.received += 1
+            box_topic.received_count += 1
             objects = _keep_valid(objects)
             frame = self._by_stamp.get(objects.stamp_ns)
-            if frame is None or topic in frame.objects:  # a bag loops, or it is early
-                box_topic.early[objects.stamp_ns] = objects, message
-                while len(box_topic.early) > MAX_EARLY_ARRAYS:
-                    box_topic.early.popitem(last=False)
-                    box_topic.unmatched += not self._holding
+            if frame is None or topic in frame.objects:  # it is early, or a bag loops
+                box_topic.early_arrays[objects.stamp_ns] = objects, message
+                while len(box_topic.early_arrays) > MAX_EARLY_ARRAYS:
+                    box_topic.early_arrays.popitem(last=False)
+                    box_topic.unmatched_count += not self._holding_pages
                 return
-            box_topic.delays.append(1e3 * (monotonic() - frame.received))
+            box_topic.delays.append(1e3 * (monotonic() - frame.received_s))
             self._add_objects(frame, topic, objects, message)
         self.update()
 
     def _add_objects(self, frame: LiveFrame, topic: str, objects: MarkedObjects,
                      message: Any) -> None:
-        """Add boxes to their frame, in the cloud's coordinates; wait for TF if that is late."""
+        """Transform boxes to the cloud's coordinates and add them to its frame.
+
+        If TF is late, they are added by a later update().
+        """
         box_topic, own = self.topics[topic], frame.cloud.header.frame_id
         trails = read_trails(message) if message is not None and box_topic.kind == TRACKS else {}
         if objects.frame_id.lstrip("/") not in ("", own.lstrip("/")):
             try:
                 pose = self.tree.lookup(own, objects.frame_id, frame.stamp_ns)
             except MissingTransform as error:
-                if error.late and monotonic() - frame.received <= MAX_WAIT_S:
+                if error.late and monotonic() - frame.received_s <= MAX_WAIT_S:
                     self._awaiting_tf.append((frame, topic, objects, message))
                 else:
                     box_topic.tf_problem = str(error)
@@ -194,14 +199,14 @@ class LiveGraph:
         frame.objects[topic] = objects
         frame.trails[topic] = {make_track_id(box_topic.number, n): trail
                                for n, trail in trails.items()}
-        if frame.shown:
-            # Labels may arrive at any time, and the first array of a topic was not expected.
-            box_topic.late += box_topic.kind != LABELS and box_topic.received > 1
+        if frame.is_shown:
+            # Labels may arrive at any time, and clouds do not wait for the first array of a topic.
+            box_topic.late_count += box_topic.kind != LABELS and box_topic.received_count > 1
             self._notify(self._make_event(frame))
 
     def update(self) -> None:
-        """Show the newest frame that has all its boxes or has waited MAX_WAIT_S, and report a
-        changed status. Call it periodically."""
+        """Show the newest frame that is complete or has waited MAX_WAIT_S, and report a changed
+        status. Call it periodically."""
         with self._lock:
             now = monotonic()
             waiting, self._awaiting_tf = self._awaiting_tf, []
@@ -209,14 +214,14 @@ class LiveGraph:
                 if topic in self.topics:
                     self._add_objects(frame, topic, objects, message)
             wanted = {topic for topic, t in self.topics.items()
-                      if t.received and t.kind != LABELS and not t.tf_problem}
+                      if t.received_count and t.kind != LABELS and not t.tf_problem}
             for frame in reversed(self._frames.values()):
-                if frame.shown:
+                if frame.is_shown:
                     break
-                if wanted <= frame.objects.keys() or now - frame.received > MAX_WAIT_S:
+                if wanted <= frame.objects.keys() or now - frame.received_s > MAX_WAIT_S:
                     for older in self._frames.values():
-                        if not older.shown and older.number <= frame.number:
-                            older.shown = True
+                        if not older.is_shown and older.number <= frame.number:
+                            older.is_shown = True
                             self._notify(self._make_event(older))
                     break
             if (status := self.get_status()) != self._last_status:
@@ -228,15 +233,14 @@ class LiveGraph:
             listener(event)
 
     def get_status(self) -> dict[str, Any]:
-        """Return the problems as lines of text, and the statistics of the clouds and of each box
-        topic."""
+        """Return the problems as text, and the statistics of the clouds and of each box topic."""
         with self._lock:
-            lines = [*self.lines, *(
+            lines = [*self.problems, *(
                 f"boxes of {topic} are not shown: {box_topic.tf_problem}"
                 for topic, box_topic in self.topics.items() if box_topic.tf_problem)]
-            return {"lines": lines, "clouds": {**self.values, "passed": self.skipped},
-                    "topics": [{"topic": topic, "kind": t.kind, "came": t.received,
-                                "late": t.late, "alone": t.unmatched,
+            return {"lines": lines, "clouds": {**self.statistics, "passed": self.skipped_count},
+                    "topics": [{"topic": topic, "kind": t.kind, "came": t.received_count,
+                                "late": t.late_count, "alone": t.unmatched_count,
                                 "ms": round(float(np.median(t.delays)), -1) if t.delays else None}
                                for topic, t in self.topics.items()]}
 
@@ -245,13 +249,12 @@ class LiveGraph:
                          "tracks": self._tracks_to_json([frame])}}
 
     def _tracks_to_json(self, frames: list[LiveFrame]) -> list[dict[str, Any]]:
-        """Convert the tracks in some frames to JSON objects of the page, with trails by frame."""
         made: list[dict[str, Any]] = []
         for topic, box_topic in self.topics.items():
             if box_topic.kind != TRACKS:
                 continue
-            with_them = {f.number: f.objects[topic] for f in frames if topic in f.objects}
-            for track in tracks_to_json(with_them, topic, box_topic.number):
+            objects = {f.number: f.objects[topic] for f in frames if topic in f.objects}
+            for track in tracks_to_json(objects, topic, box_topic.number):
                 track["trails"] = {
                     f.number: np.round(f.trails[topic][track["id"]], 3).tolist() for f in frames
                     if track["id"] in f.trails.get(topic, ())}
@@ -259,14 +262,14 @@ class LiveGraph:
         return made
 
     def list_tracks(self) -> list[dict[str, Any]]:
-        """Return the tracks of all shown frames, as JSON objects of the page."""
+        """Return the tracks in all shown frames, as JSON objects of the page."""
         with self._lock:
-            return self._tracks_to_json([f for f in self._frames.values() if f.shown])
+            return self._tracks_to_json([f for f in self._frames.values() if f.is_shown])
 
     def list_frames(self) -> list[dict[str, Any]]:
-        """List the shown frames, as in the answer of /api/drive."""
+        """Return the shown frames, as in the answer of /api/drive."""
         with self._lock:
-            return [_frame_to_json(frame) for frame in self._frames.values() if frame.shown]
+            return [_frame_to_json(frame) for frame in self._frames.values() if frame.is_shown]
 
     def _get_frame(self, i: int) -> LiveFrame:
         with self._lock:
@@ -275,13 +278,15 @@ class LiveGraph:
             return frame
 
     def load_scan(self, i: int) -> Scan:
-        """Return the scan of a frame, with the cloud's ground and clusters. InputError if the cloud
-        is invalid or no longer stored."""
+        """Return the scan of a frame. InputError if the cloud is invalid or no longer stored."""
         return scan_from_message(self._get_frame(i).cloud, scale=self._scale)
 
     def layers(self, i: int, min_score: float) -> dict[str, Any]:
         """Return the answer of /api/labels: labels, detections, and missed labels at a minimum
-        score. False detections are unknown, as it is unknown where labels end."""
+        score.
+
+        False detections are not listed, as the labelled area is unknown.
+        """
         with self._lock:
             objects = self._get_frame(i).objects
             of_kind = {kind: {t: o for t, o in objects.items() if t in self.topics
@@ -295,14 +300,14 @@ class LiveGraph:
 
 
 def _keep_valid(objects: MarkedObjects) -> MarkedObjects:
-    """Keep objects with finite numbers and positive sizes; nodes may send others."""
-    good = (np.isfinite(objects.boxes).all(axis=1) & (objects.boxes[:, 3:6] > 0).all(axis=1)
-            & np.isfinite(objects.scores))
-    if good.all():
+    """Drop objects with numbers that are not finite, or sizes that are not positive."""
+    valid = (np.isfinite(objects.boxes).all(axis=1) & (objects.boxes[:, 3:6] > 0).all(axis=1)
+             & np.isfinite(objects.scores))
+    if valid.all():
         return objects
-    rows = np.flatnonzero(good).tolist()
-    return replace(objects, boxes=objects.boxes[good], scores=objects.scores[good],
-                   ids=objects.ids[good], labels=[objects.labels[k] for k in rows],
+    rows = np.flatnonzero(valid).tolist()
+    return replace(objects, boxes=objects.boxes[valid], scores=objects.scores[valid],
+                   ids=objects.ids[valid], labels=[objects.labels[k] for k in rows],
                    extras=[objects.extras[k] for k in rows])
 
 

@@ -1,5 +1,5 @@
-"""Selection of the topics of a running graph to show: the clouds with the most columns, and the
-boxes that belong to them."""
+"""Selection of the topics to show of a running graph: the clouds with the most columns, and their
+boxes."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ ARRAY_SUFFIX = "_3d"  # of a topic of markers that is also published as Detectio
 
 
 def parse_namespace(topic: str) -> str:
-    """Return the namespace of the node that publishes a topic, by the topic's name.
+    """Return the namespace of the node that publishes a topic, from the name of the topic.
 
-    NS for /NS/NODE/output/NAME and /NS/ground_truth/detections, else everything before the last
+    NS for /NS/NODE/output/NAME and /NS/ground_truth/detections, else the part before the last
     slash; "" is the root.
     """
     parts = topic.removesuffix(ARRAY_SUFFIX).strip("/").split("/")
@@ -33,8 +33,10 @@ def parse_namespace(topic: str) -> str:
 
 
 def is_in_namespace(topic: str, namespace: str) -> bool:
-    """Return True if the node of a topic is in a namespace or below it; "" is every namespace, "/"
-    only the root."""
+    """Return True if the node of a topic is in a namespace or below it.
+
+    The namespace "" contains all topics, "/" only those in the root.
+    """
     inside = namespace.strip("/")
     if inside:
         return topic.startswith(f"/{inside}/")
@@ -51,22 +53,22 @@ def select_cloud_topic(types: Mapping[str, str], namespace: str = "", wanted: st
     """Select the cloud topic: `wanted`, else the one with the most columns, else the only one.
 
     Args:
-        types: type of each published topic.
+        types: types of the published topics, by name.
 
     Raises:
-        InputError: there is no such topic, or several are equally good.
+        InputError: there is no such topic, or the choice is ambiguous.
     """
     clouds = sorted(t for t, kind in types.items() if kind == POINT_CLOUD)
     where = f" in the namespace {namespace}" if namespace else ""
     if wanted:
         full = resolve_topic(wanted, namespace)
         if full not in clouds:
-            raise InputError(f"nobody publishes clouds on {full}; there are clouds on "
+            raise InputError(f"no node publishes clouds on {full}; there are clouds on "
                              f"{', '.join(clouds) or 'no topic'}")
         return full
     inside = [t for t in clouds if is_in_namespace(t, namespace)]
     if not inside:
-        raise InputError(f"nobody publishes clouds{where}; is the graph running, on this "
+        raise InputError(f"no node publishes clouds{where}; is the graph running, on this "
                          "ROS_DOMAIN_ID?" + (f" There are clouds on {', '.join(clouds)}"
                                              if clouds else ""))
     for end in CLOUD_ENDINGS:
@@ -81,13 +83,14 @@ def select_cloud_topic(types: Mapping[str, str], namespace: str = "", wanted: st
 
 def select_box_topics(types: Mapping[str, str], clouds: str, namespace: str = "",
                       wanted: Iterable[str] = ()) -> dict[str, str]:
-    """Select the box topics that belong to a cloud topic, with their kind: BOXES, TRACKS or LABELS.
-
-    A Detection3DArray that is also published as markers is left out.
+    """Select the box topics that belong to a cloud topic; leave out copies as Detection3DArray.
 
     Args:
-        types: type of each published topic.
-        wanted: topics of detections, empty for all.
+        types: types of the published topics, by name.
+        wanted: topics of detections; empty for all.
+
+    Returns:
+        BOXES, TRACKS or LABELS by topic.
     """
     found = {}
     for topic, kind in types.items():
@@ -109,12 +112,11 @@ def select_box_topics(types: Mapping[str, str], clouds: str, namespace: str = ""
 
 
 def _infer_namespace(clouds: str, found: Mapping[str, str]) -> str:
-    """Infer the namespace of the boxes that belong to clouds, as for is_in_namespace().
+    """Infer the namespace of the boxes that belong to a cloud topic, as for is_in_namespace().
 
-    For clouds of one of our nodes it is the node's namespace. A driver's topic may be named after
-    the sensor, such as /ouster/points, so the nearest parent namespace with boxes is used. If all
-    boxes belong to one robot, they are all shown, except with NS/points, which may belong to
-    another robot.
+    Our own nodes publish both in one namespace. The topic of a driver may be named after the
+    sensor, such as /ouster/points, so the nearest parent namespace with boxes is used. If there is
+    only one robot with boxes, all are shown, except for NS/points, which may be another robot's.
     """
     own = parse_namespace(clouds)
     if "/output/" in clouds:

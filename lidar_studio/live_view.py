@@ -1,4 +1,4 @@
-"""The node of `view --live`: subscribes to a running graph and passes its messages to the page."""
+"""Node of `view --live`: receives the messages of a running graph for the page."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from msg_utils.detections import from_detection_array
 from msg_utils.markers import from_marker_array
 from msg_utils.messages import load_message_class
 
-SCAN_PERIOD_S = 1.0   # between looks at the list of topics
-STOP_TIMEOUT_S = 5.0  # for the message that is being handled
+SCAN_PERIOD_S = 1.0   # of the list of topics
+STOP_TIMEOUT_S = 5.0  # to handle the last message
 RECEPTION = ReceptionParams(queue=5)
 SHOWN_PROBLEMS = "publishers", "silent", "stale", "lost", "dropped"  # kinds of Reception.problems
 
 
 class LiveView(ExternalNode):
-    """Subscribes to the topics of a graph while run() is running.
+    """Subscriber to the topics of a graph while run() is running.
 
     Args:
-        clouds: topic of clouds, "" for the one that live_topics selects.
-        boxes: topics of detections, empty for those that live_topics selects.
+        clouds: topic of the clouds; "" to choose one by select_cloud_topic.
+        boxes: topics of detections; () to choose them by select_box_topics.
     """
 
     def __init__(self, live: LiveGraph, domain: int | None = None, namespace: str = "",
@@ -55,11 +55,11 @@ class LiveView(ExternalNode):
                                                    static=topic == TF_STATIC)), qos, raw=True)
 
     def run(self, stop: threading.Event) -> None:
-        """Spin until `stop` is set; an exception is also shown on the page."""
+        """Spin until `stop` is set. An exception is shown on the page and raised."""
         try:
             self.spin_until(stop.is_set, math.inf, self._step)
         except Exception as error:  # nobody joins this thread
-            self.live.lines = [f"reception has stopped: {type(error).__name__}: "
+            self.live.problems = [f"reception has stopped: {type(error).__name__}: "
                                f"{shorten_error(error)}; start view again"]
             self.live.update()
             raise
@@ -71,8 +71,10 @@ class LiveView(ExternalNode):
         self.live.update()
 
     def update_topics(self) -> None:
-        """Subscribe to the topics to show and unsubscribe from others. A cloud topic without
-        publishers is kept until there is another one."""
+        """Subscribe to the topics to show, and unsubscribe from others.
+
+        A cloud topic whose publisher has gone is kept until there is another one.
+        """
         types = {topic: kinds[0] for topic, kinds in self.node.get_topic_names_and_types()
                  if len(kinds) == 1 and self.node.count_publishers(topic)}
         self.problem = ""
@@ -112,7 +114,7 @@ class LiveView(ExternalNode):
             try:
                 take(decode_message(data, kind))
                 self.decode_errors.pop(topic, None)
-            except Exception as error:  # any node may send an invalid message
+            except Exception as error:  # other nodes may send invalid messages
                 self.decode_errors[topic] = f"{topic}: {shorten_error(error)}"
         return handle
 
@@ -125,18 +127,18 @@ class LiveView(ExternalNode):
         clouds = self.receptions.get(self.clouds)
         lines = [self.problem] if self.problem else []
         if clouds is not None:
-            self.live.values = {"topic": self.clouds, **clouds.values()}
+            self.live.statistics = {"topic": self.clouds, **clouds.values()}
             if not self.problem:
                 lines += [text for kind, _, text in clouds.problems() if kind in SHOWN_PROBLEMS]
                 if clouds.last_time is None:
-                    lines.append(f"no cloud received on {self.clouds} yet")
+                    lines.append(f"no cloud has arrived on {self.clouds} yet")
         for topic, reception in self.receptions.items():
             lost = reception.arrivals.lost + reception.arrivals.dropped
             if topic != self.clouds and lost:
                 lines.append(f"{lost} of {reception.arrivals.sent} arrays on {topic} were lost")
         if any(box_topic.tf_problem for box_topic in self.live.topics.values()) and not has_tf():
             lines.append(NO_TF)
-        self.live.lines = [*lines, *self.decode_errors.values()]
+        self.live.problems = [*lines, *self.decode_errors.values()]
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Proposed tracks of a drive, from detections and from clusters that are similar to the seeds."""
+"""Proposed tracks of a drive, from detections and from clusters that are similar to seeds."""
 
 from __future__ import annotations
 
@@ -19,23 +19,27 @@ from lidar_perception.tracking.state import Tracks
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
 from lidar_studio.interpolation import Motion, fill_gaps
-from lidar_studio.size_similarity import compute_size_similarity
-from lidar_studio.snap import complete_box, find_usual_size
+from lidar_studio.snap import LONG_OBJECT_M, complete_box, find_usual_size
 from lidar_studio.state import PROPOSED, Box, Track
 from lidar_studio.survey import FrameSurvey
 
 Array = np.ndarray[Any, Any]
 PlacedBox = tuple[Array, str]  # a box (7,) and its class
+Hit = tuple[int, Array, int, float, bool]  # frame, box, class id, score, and True for a candidate
 SAME_OBJECT_DISTANCE_M = 0.6  # between the centres of a candidate and a detection of one person
 MIN_CONFIDENCE = 0.3          # of a candidate
-UNDETECTED_WEIGHT = 0.5       # of a size similarity where the detector found nothing
+UNDETECTED_WEIGHT = 0.5       # of the size similarity of objects without a detection
 MIN_HITS = 2                  # of a proposed track, unless there is only one frame
 MIN_SCORE = 0.3               # of a proposed track
 PLACED_SCORE = 0.95           # of a box that a person placed
 CANDIDATES = "candidates"     # source of a track without detections
 MAX_HIT_DISTANCE_M = 1.0      # between a track and the detection that updated it
 NO_HIT = -1
-# The tracker reports every track; uncertain ones are dropped when they are complete.
+# Standard deviations of a cluster's size, as shares of the seed's length, width or height. Hidden
+# parts make a cluster shorter, so a deficit in length counts less than an excess.
+LENGTH_EXCESS, LENGTH_DEFICIT, WIDTH_EXCESS, HEIGHT_DEVIATION = 0.12, 0.3, 0.2, 0.12
+END_VIEW_PENALTY = 0.5        # deviation added where only the front or rear may be visible
+# The tracker reports every track; uncertain ones are dropped at the end.
 ALL_TRACKS = TrackingParams(report=0.0, report_unseen=0.0)
 
 
@@ -57,9 +61,9 @@ class SizeSeed:
 
 @dataclass(frozen=True)
 class ProposalRequest:
-    """Seeds of similar objects to propose, and by frame the boxes that a person placed.
+    """Seeds of the objects to propose, and the boxes that a person placed, by frame.
 
-    detected: the survey has detections, so clusters that only have the size of a seed count less.
+    detected: the survey has detections, so that clusters of a seed's size count less.
     """
 
     seeds: Sequence[SilhouetteSeed] = ()
@@ -69,7 +73,7 @@ class ProposalRequest:
 
 
 def compute_likeness(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> Array:
-    """Compute the probability that each cluster is a person, (C,) float64, by its most similar
+    """Compute the probability that each cluster is a person, (C,) float64, from its most similar
     seed; 0 without seeds."""
     best = np.zeros(len(survey.boxes))
     for seed in seeds if len(survey.boxes) else ():
@@ -79,12 +83,33 @@ def compute_likeness(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> Ar
     return best
 
 
+def compute_size_similarity(shapes: Array, size: Size) -> Array:
+    """Compute how well clusters fit the visible part of an object of a size, (T,) float64 in 0..1.
+
+    Objects longer than LONG_OBJECT_M may show only their front or rear, so the longer side of a
+    cluster may also be the width.
+
+    Args:
+        shapes: (T, 7) L-shapes of the clusters, down to the ground.
+        size: length, width and height in metres.
+    """
+    length, width, height = size
+    long, short, tall = (shapes[:, k].astype(np.float64) for k in (3, 4, 5))
+    excess = long / length - 1
+    deviation = np.hypot(np.where(excess > 0, excess / LENGTH_EXCESS, excess / LENGTH_DEFICIT),
+                         np.maximum(short / width - 1, 0) / WIDTH_EXCESS)
+    if length > LONG_OBJECT_M:
+        deviation = np.minimum(
+            deviation, np.hypot((long / width - 1) / WIDTH_EXCESS, END_VIEW_PENALTY))
+    return np.exp(-0.5 * (deviation ** 2 + ((tall / height - 1) / HEIGHT_DEVIATION) ** 2))
+
+
 def find_objects(survey: FrameSurvey, request: ProposalRequest,
                  placed: Sequence[PlacedBox] = ()) -> tuple[Detections, Array]:
-    """Return the objects of a frame, and which of them are candidates, (K,) bool.
+    """Return the objects of a frame, and a mask (K,) bool of the candidates among them.
 
-    Objects are the detections, candidates where there is no detection, and the boxes that a person
-    placed, which replace others at the same place.
+    Objects are detections, candidates where there is no detection, and boxes that a person placed,
+    which replace others at the same place.
     """
     detections, candidates = _add_similar_objects(survey, request,
                                                   *_find_people(survey, request.seeds))
@@ -112,7 +137,7 @@ def _find_people(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> tuple[
 
 def _add_similar_objects(survey: FrameSurvey, request: ProposalRequest, found: Detections,
                          candidates: Array) -> tuple[Detections, Array]:
-    """Add clusters of the size of a seed that is not a pedestrian, where nothing is found."""
+    """Add clusters of the size of another seed where there is no object."""
     sizes = request.sizes
     if not sizes or not len(survey.shapes):
         return found, candidates
@@ -146,20 +171,20 @@ def propose_tracks(surveys: Sequence[FrameSurvey], request: ProposalRequest,
     Returns:
         Tracks with id 0, or None if cancelled.
     """
-    tracker, hits = Tracker(ALL_TRACKS), dict[int, list[tuple[int, Array, int, float, bool]]]()
+    tracker, hits = Tracker(ALL_TRACKS), dict[int, list[Hit]]()
     for i in frames:
         if not on_progress(i - frames.start):
             return None
         found, candidates = find_objects(surveys[i], request, request.placed.get(i, ()))
         pose = None if motion.poses is None else motion.poses[i]
         tracks = tracker(found, stamps_ns[i], pose)
-        by = _match_detections(tracks, found)
-        for k in np.flatnonzero(by != NO_HIT):
-            box = tracks.detections.boxes[k].astype(np.float64)
-            box[:3] = found.boxes[by[k], :3]
+        matches = _match_detections(tracks, found)
+        for k in np.flatnonzero(matches != NO_HIT):
+            match, box = matches[k], tracks.detections.boxes[k].astype(np.float64)
+            box[:3] = found.boxes[match, :3]
             hits.setdefault(int(tracks.ids[k]), []).append(
-                (i, box, int(tracks.detections.class_ids[k]), float(found.scores[by[k]]),
-                 bool(candidates[by[k]])))
+                (i, box, int(tracks.detections.class_ids[k]), float(found.scores[match]),
+                 bool(candidates[match])))
     min_hits = min(MIN_HITS, len(frames))
     made = [_make_track(rows, motion) for rows in hits.values() if len(rows) >= min_hits]
     return sorted((t for t in made if t.score >= MIN_SCORE), key=lambda t: -t.score)
@@ -167,7 +192,7 @@ def propose_tracks(surveys: Sequence[FrameSurvey], request: ProposalRequest,
 
 def _match_detections(tracks: Tracks, found: Detections) -> np.ndarray:
     """Return the detection that updated each track, (K,) int64: the nearest one within
-    MAX_HIT_DISTANCE_M, NONE for a track that was not updated."""
+    MAX_HIT_DISTANCE_M, or NO_HIT."""
     if len(found) == 0:
         return np.full(len(tracks), NO_HIT)
     distances = centre_distances(tracks.detections.boxes, found.boxes)
@@ -175,7 +200,7 @@ def _match_detections(tracks: Tracks, found: Detections) -> np.ndarray:
     return np.where(tracks.seen & (distances.min(axis=1) <= MAX_HIT_DISTANCE_M), nearest, NO_HIT)
 
 
-def _make_track(hits: list[tuple[int, Array, int, float, bool]], motion: Motion) -> Track:
+def _make_track(hits: list[Hit], motion: Motion) -> Track:
     frames, boxes, classes, scores, candidates = zip(*hits)
     name = CLASSES[np.bincount(classes, weights=scores).argmax()]
     size = np.median([b[3:6] for b in boxes], axis=0)

@@ -1,5 +1,5 @@
-"""Proposals for a labelling session: runs the survey of the drive and merges proposed tracks with
-the existing ones."""
+"""Proposals for a labelling session: survey of the drive, seeds, and merging with existing
+tracks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lidar_perception.candidates.silhouette import compute_similarity, to_pixels
 from lidar_perception.classes import Size
 from lidar_perception.detectors.contract import FUSED
 from lidar_perception.detectors.open import DetectorChoice
-from lidar_perception.geometry import centre_distances, points_in_box, to_box_frame
+from lidar_perception.geometry import centre_distances, points_in_box
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 from lidar_studio import survey_cache
 from lidar_studio.drive import Drive
@@ -32,13 +32,11 @@ from lidar_studio.proposals import (
     SizeSeed,
     propose_tracks,
 )
-from lidar_studio.size_similarity import choose_cell_size, compute_size_similarity, draw_side_view
 from lidar_studio.state import KEY, Box, State, Track
 from lidar_studio.survey import FrameSurvey, survey_drive
 
 Array = np.ndarray[Any, Any]
 BOX_MARGIN_M = 0.1             # around a box, when taking its points
-MIN_POINTS = 5                 # of a cluster that is compared with a seed
 # Two tracks are the same object if enough boxes coincide: this share of the shorter track's boxes,
 MIN_COMMON_SHARE = 0.5
 SAME_TRACK_DISTANCE_M = 0.7    # with centres within this distance,
@@ -48,16 +46,16 @@ SAME_TRACK_LENGTH_SHARE = 0.4  # or within this share of the length
 class Proposer:
     """Proposals for a drive.
 
-    detector: None for proposals from seeds only.
-    folder: of the cached survey, None for no cache.
-    problem: of the cache, or "".
+    detector: None to propose from seeds only.
+    folder: folder of the cached survey; None: no cache.
+    problem: error message of the cache, or "".
     """
 
     def __init__(self, drive: Drive, detector: DetectorChoice | None = DetectorChoice(),
                  folder: Path | None = None) -> None:
         self.drive, self.detector, self.folder = drive, detector, folder
         self.problem = ""
-        self._surveys: list[FrameSurvey] = []  # of the first frames, maybe not yet of all
+        self._surveys: list[FrameSurvey] = []  # incomplete until all frames are surveyed
         self._seeds: dict[tuple[int, tuple[float, ...]], Seed | None] = {}
 
     @property
@@ -78,21 +76,15 @@ class Proposer:
         except InputError as error:
             self.problem = str(error)
 
-    def run_survey(self, on_progress: Callable[[int], bool], in_process: bool = False) -> bool:
-        """Survey the remaining frames and cache the result.
+    def run_survey(self, on_progress: Callable[[int], bool]) -> bool:
+        """Survey the remaining frames and cache the result; return True unless cancelled.
 
-        Args:
-            on_progress: called with the number of surveyed frames; returns False to cancel.
-            in_process: run in this process instead of a separate one.
-
-        Returns:
-            True unless cancelled.
+        on_progress: called with the number of surveyed frames; returns False to cancel.
         """
         surveys = self._surveys
         if self.folder is not None and not surveys:
             survey_cache.clear(self.folder)
-        with closing(survey_drive(self.drive, self.detector, in_process,
-                                  len(surveys))) as new_surveys:
+        with closing(survey_drive(self.drive, self.detector, len(surveys))) as new_surveys:
             for survey in new_surveys:
                 if survey is not None:
                     surveys.append(survey)
@@ -114,8 +106,8 @@ class Proposer:
             self.problem = str(error)
 
     def collect_scan_poses(self) -> list[list[float]] | None:
-        """Return the sensor's pose in each frame from scan matching, 16 numbers each; None if the
-        drive has poses or scan matching gave none."""
+        """Return the poses from scan matching, 16 numbers per frame; None if the drive has its own
+        poses or scan matching gave none."""
         if self.drive.motion.poses is not None or not self.surveys:
             return None
         found = [survey.pose for survey in self.surveys if survey.pose is not None]
@@ -125,8 +117,10 @@ class Proposer:
     def make_proposals(self, state: State, motion: Motion, frames: range | None = None,
                        on_progress: Callable[[int], bool] = lambda count: True
                        ) -> list[Track] | None:
-        """Return proposed tracks in some frames (None: all) of a surveyed drive, or None if
-        cancelled; on_progress as in propose_tracks()."""
+        """Return proposed tracks in some frames (None: all) of a surveyed drive; None if cancelled.
+
+        on_progress: see propose_tracks().
+        """
         seeds = [SilhouetteSeed(seed.silhouette(BEST), seed.height)
                  for seed in self.find_seeds(state)]
         sizes = [SizeSeed(t.class_name, _track_size(t, f))
@@ -169,16 +163,17 @@ class Proposer:
             return None
 
     def compare_with_seed(self, state: State, track: Track, frame: int) -> dict[str, Any]:
-        """Return the answer of /api/silhouettes: a track in a frame next to its most similar seed.
+        """Compare the silhouette of a pedestrian's track in a frame with the most similar seed.
 
-        Pedestrians are shown as silhouettes, other classes as side views. InputError if there is
-        nothing to compare.
+        Returns:
+            The answer of /api/silhouettes.
+
+        Raises:
+            InputError: there is no seed, or the track has too few points in this frame.
         """
-        if track.class_name != CLASSES[PEDESTRIAN]:
-            return self._compare_side_views(state, track, frame)
-        seeds = self.find_seeds(state)
+        seeds = self.find_seeds(state) if track.class_name == CLASSES[PEDESTRIAN] else []
         if not seeds:
-            raise InputError("there is no seed yet; click a pedestrian")
+            raise InputError("there is no seed of a pedestrian to compare with; click a pedestrian")
         box = track.boxes.get(frame)
         candidate = None if box is None else self.cut_seed(np.array(box.values), frame)
         if candidate is None:
@@ -188,30 +183,6 @@ class Proposer:
         best = int(np.argmax(scores))
         return {"seed": _bits_to_json(to_pixels(templates[best])),
                 "candidate": _bits_to_json(to_pixels(image)), "similarity": scores[best]}
-
-    def _compare_side_views(self, state: State, track: Track, frame: int) -> dict[str, Any]:
-        seeds = [(f, t) for f, t in self._find_size_seeds(state)
-                 if t.class_name == track.class_name]
-        if not seeds:
-            raise InputError(f"there is no seed of class {track.class_name} yet; click one")
-        if frame not in track.boxes:
-            raise InputError(f"track {track.id} has no box in frame {frame}")
-        box = np.array(track.boxes[frame].values)
-        points = self._points_inside(frame, box)
-        in_box = to_box_frame(points, box)
-        if len(points) < MIN_POINTS:
-            raise InputError(f"track {track.id} has too few points in frame {frame} to be compared")
-        # The box gives the heading, so the extent of the points is their L-shape.
-        sides, shape = np.ptp(in_box[:, :2], axis=0), box.copy()
-        shape[3:6] = sides.max(), sides.min(), in_box[:, 2].max() + box[5] / 2
-        scores = [float(compute_size_similarity(shape[None], _track_size(t, f))[0])
-                  for f, t in seeds]
-        f, seed = seeds[int(np.argmax(scores))]
-        seed_box = np.array(seed.boxes[f].values)
-        cell, seed_points = choose_cell_size(box, seed_box), self._points_inside(f, seed_box)
-        return {"seed": _bits_to_json(draw_side_view(seed_points, seed_box, cell)),
-                "candidate": _bits_to_json(draw_side_view(points, box, cell)),
-                "similarity": max(scores)}
 
     def _points_inside(self, frame: int, box: Array) -> Array:
         scan = self.drive.load_scan(frame)
@@ -245,12 +216,11 @@ def merge_proposals(state: State, proposals: Sequence[Track],
                     motion: Motion) -> tuple[list[Track], list[int]]:
     """Merge new proposals with the existing tracks.
 
-    Tracks that a person decided on or changed stay, except that a clicked track is extended by the
-    proposal at its place. Other proposals replace an earlier proposal at their place and take its
-    id; earlier proposals without a new one are removed.
+    Tracks that a person accepted, rejected or edited stay; a matching proposal extends a clicked
+    track. Earlier proposals are replaced by matching new ones, which take their ids, or removed.
 
     Returns:
-        The tracks that are new or have changed, and the ids of removed tracks.
+        New and changed tracks, and the ids of removed tracks.
     """
     index = _TrackIndex(state.tracks)
     waiting = {t.id for t in state.tracks.values()
@@ -278,10 +248,10 @@ def merge_proposals(state: State, proposals: Sequence[Track],
 
 def extend_track(clicked: Track, boxes: Mapping[int, Box], motion: Motion) -> Track:
     """Extend a clicked track by the boxes of a proposal, corrected by the track's key boxes."""
-    found: Mapping[int, Box] = {f: b for f, b in boxes.items() if f not in clicked.gone}
+    found: Mapping[int, Box] = {f: b for f, b in boxes.items() if f not in clicked.removed_frames}
     for frame, box in sorted(clicked.boxes.items()):
         if box.kind == KEY:
-            found = apply_correction(found, clicked.gone, frame, box.values, motion)
+            found = apply_correction(found, clicked.removed_frames, frame, box.values, motion)
     return replace(clicked, boxes=dict(sorted(found.items())), nearby=False)
 
 

@@ -1,6 +1,6 @@
 """Results to view: labels, detections of each source with missed and false ones, and tracks.
 
-Read from a bag or from result files, or detected on request.
+They are read from a bag or from result files, or detected on request.
 """
 
 from __future__ import annotations
@@ -44,18 +44,16 @@ SIMILAR_CLASS = {row.name: row.looks_like or row.name for row in TABLE}
 CLUSTERED_TOPICS = ("/clustering/output/points", "/perception/output/points")
 MAX_SOURCES = 8  # shown per detection
 MAX_CACHED_FRAMES = 2000
-TRACKER_ID_STEP = 10**10  # from the ids of one tracker to the next; marker ids have 32 bits
-
-
-def use_recorded_scans(drive: Drive) -> Drive:
-    """Return the drive of a bag with scans that use recorded ground and clusters."""
-    return replace(drive, scan=read_recorded_scan)
+TRACKER_ID_STEP = 10**10  # between the ids of two trackers; marker ids have 32 bits
 
 
 @dataclass(frozen=True)
 class Source:
-    """A source of detections. find(i, frame): detections in frame i; classes: names of the classes
-    that it can detect."""
+    """A source of detections.
+
+    find: (i, frame) -> the detections in frame i.
+    classes: names of the classes that the source can detect.
+    """
 
     find: Callable[[int, Frame], Detections]
     classes: frozenset[str] = frozenset(DETECTED)
@@ -69,8 +67,8 @@ class Results:
     tracks: tuple[dict[str, Any], ...] = ()
 
     def layers(self, i: int, frame: Frame, min_score: float) -> dict[str, Any]:
-        """Return the answer of /api/labels for frame i: labels, detections, and which of them are
-        missed or false at a minimum score."""
+        """Return the answer of /api/labels for frame i: labels and detections, with the missed and
+        false ones at a minimum score."""
         truth = frame.truth()
         camera = frame.camera() if self.sources and truth is not None else None
         found = {name: source.find(i, frame) for name, source in self.sources.items()}
@@ -80,15 +78,16 @@ class Results:
         return layers_to_json(truth, found, matches)
 
     def bind_layers(self, drive: Drive) -> Callable[[int, float], dict[str, Any]]:
-        """Return the function (i, min_score) that calls layers() for a drive."""
+        """Return layers() for the frames of a drive, as a function of (i, min_score)."""
         return lambda i, min_score: self.layers(i, drive.frames[i], min_score)
 
 
 def layers_to_json(truth: GroundTruth | None, found: Mapping[str, Detections],
                    matches: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert labels, and detections by source, to rows: box, class, and track id or score.
+    """Convert labels and detections to rows: box, class, and track id or score.
 
-    Rows of detections end with the probabilities of the detection's own sources.
+    found: detections by source; their rows end with the probabilities by the detector's own
+        sources.
     """
     labels = [] if truth is None else [
         [*map(float, box), name, extra.get("track_id")]
@@ -107,16 +106,16 @@ def match_detections(truth: GroundTruth, found: Detections, min_score: float,
                      classes: frozenset[str] = frozenset(DETECTED)) -> dict[str, list[int]]:
     """Compare the detections of at least min_score with the labels.
 
-    A hit overlaps by the class's relaxed share in BEV, or is a pedestrian with its centre within
-    1 m. All labels are hit, missed or ignored; all these detections are hits, false or ignored.
+    A hit reaches the relaxed BEV overlap of its class, or is a pedestrian with its centre within
+    1 m. Every label is hit, missed or ignored; every detection is a hit, false or ignored.
 
     Args:
         camera: detections outside its view are ignored, as labels end there.
-        classes: classes that can be detected; labels of others are ignored. So are objects that
-            only look like one of them, such as a van, and detections on them.
+        classes: classes that the source can detect. Labels of other classes are ignored, and so are
+            similar objects, such as vans, and detections on them.
 
     Returns:
-        Row numbers: `missed` and `ignored_labels` of labels, `false` and `ignored` of detections.
+        Indices: `missed` and `ignored_labels` of labels, `false` and `ignored` of detections.
     """
     missed, false, hits = [], [], []
     true_names = np.array([SIMILAR_CLASS[CLASSES[c]] for c in truth.class_ids], object)
@@ -148,7 +147,7 @@ def match_detections(truth: GroundTruth, found: Detections, min_score: float,
 
 
 def make_detector_source(detector: Detector) -> Source:
-    """Make a source that runs a detector on request and caches the result."""
+    """Make a source that runs a detector on request, with a cache."""
     @lru_cache(maxsize=MAX_CACHED_FRAMES)
     def detect(i: int, frame: Frame) -> Detections:
         return detector(frame.load()).detections
@@ -156,9 +155,9 @@ def make_detector_source(detector: Detector) -> Source:
 
 
 def make_file_source(folder: Path) -> Source:
-    """Make a source of KITTI result files: folder/NAME.txt, or a run of `detect` in `folder`.
+    """Make a source of KITTI result files, folder/NAME.txt, or of the folder of a `detect` run.
 
-    A frame without a file has no detections. InputError for an invalid file.
+    A frame without a file has no detections. Reading an invalid file raises InputError.
     """
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder} with result files")
@@ -175,22 +174,19 @@ def make_file_source(folder: Path) -> Source:
 
 
 def choose_points_topic(path: Path) -> str:
-    """Return the cloud topic of a bag to show: one with clusters, else that of
-    bag_frames.choose_cloud_topic. InputError if that is ambiguous."""
+    """Return the cloud topic to show of a bag: one with clusters, else as choose_cloud_topic.
+
+    Raises InputError if the choice is ambiguous.
+    """
     with Bag(path) as bag:
         clustered = [topic for topic in CLUSTERED_TOPICS if bag.counts.get(topic)]
         return clustered[0] if clustered else choose_cloud_topic(bag)
 
 
 def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:
-    """Read the detections of every node and all tracks of a bag.
+    """Read the detections and tracks of all nodes in a bag, by the stamps (ns) of the clouds.
 
-    A message belongs to the cloud with the same stamp. A topic whose boxes cannot be transformed to
-    the clouds' frame is left out, with a warning.
-
-    Args:
-        poses: of the bag's clouds.
-        stamps: of the clouds, in nanoseconds.
+    A topic whose boxes cannot be transformed to the clouds' frame is left out, with a warning.
     """
     bag = poses.handle.bag()
     wanted = {topic for topic, kind in bag.topics.items() if kind == MARKERS and topic != TRUTH
@@ -216,8 +212,7 @@ def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:
 
 
 def detections_with_sources(objects: MarkedObjects) -> Detections:
-    """Convert markers to detections, with the probabilities of their sources if the text has
-    them."""
+    """Convert markers to detections, with the probabilities of sources that their text contains."""
     parts = [e["sources"] if isinstance(e.get("sources"), dict) else {} for e in objects.extras]
     names = list(dict.fromkeys(name for row in parts for name in row))[:MAX_SOURCES]
     return replace(to_detections(objects), sources={
@@ -240,8 +235,10 @@ def _make_source(found: Mapping[int, Detections]) -> Source:
 
 
 def read_recorded_scan(frame: Frame) -> Scan:
-    """Return the scan of a bag's frame with recorded ground and clusters, or segment the cloud if
-    there are none. InputError if it cannot be read."""
+    """Return the scan of a bag's frame, with recorded ground and clusters if there are any.
+
+    Raises InputError if it cannot be read.
+    """
     message = frame.native()
     is_segmented = {"ground", "cluster_id"} <= {field.name for field in message.fields}
     return (scan_from_message(message, frame.intensity_max()) if is_segmented
@@ -250,8 +247,10 @@ def read_recorded_scan(frame: Frame) -> Scan:
 
 def scan_from_message(message: Any, intensity_max: float = 0.0,
                       scale: FullScale = infer_full_scale) -> Scan:
-    """Convert a PointCloud2 to a scan; ground and clusters are empty without such columns.
-    intensity_max, scale: see to_point_cloud. InputError for an invalid message."""
+    """Convert a PointCloud2 to a scan; without such columns it has neither ground nor clusters.
+
+    intensity_max, scale: see to_point_cloud. Raises InputError for an invalid message.
+    """
     cloud, indices = to_point_cloud(message, intensity_max, scale)
     ground, clusters = read_column(message, "ground", indices), read_cluster_ids(message, indices)
     return to_scan(cloud, np.zeros(len(cloud), bool) if ground is None else ground > 0,
@@ -259,14 +258,16 @@ def scan_from_message(message: Any, intensity_max: float = 0.0,
 
 
 def make_track_id(tracker: int, number: int) -> int:
-    """Make the page's id of a track, unique over all trackers; `tracker` counts from 0."""
+    """Return the id of a track on the page, unique over all trackers; `tracker` counts from 0."""
     return tracker * TRACKER_ID_STEP + number % TRACKER_ID_STEP
 
 
 def tracks_to_json(frames: Mapping[int, MarkedObjects], topic: str,
                    tracker: int) -> list[dict[str, Any]]:
-    """Convert a tracker's messages, by frame, to tracks of the page. tracker: as in
-    make_track_id."""
+    """Convert the messages of a tracker, by frame, to JSON objects of tracks.
+
+    tracker: see make_track_id.
+    """
     made: dict[int, dict[str, Any]] = {}
     for i in sorted(frames):
         objects = frames[i]

@@ -1,4 +1,4 @@
-"""HTTP server of the page, for one drive or one running graph; local only, with a token."""
+"""HTTP server of the page; it only serves this machine, and requests need a token."""
 
 from __future__ import annotations
 
@@ -6,20 +6,25 @@ import asyncio
 import hmac
 import logging
 import re
+import secrets
 import signal
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from aiohttp import WSMsgType, web
 
+from lidar_perception.detectors.params import ScoreParams
+from lidar_perception.labels.exchange import FORMATS
 from lidar_perception.runs.files import shorten_error
-from lidar_perception.types import InputError
+from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 from lidar_studio.actions import require_track
-from lidar_studio.page_content import PageContent
+from lidar_studio.drive import Drive, list_classes
+from lidar_studio.live_graph import LiveGraph
 from lidar_studio.session import Session
 from lidar_studio.state import find_next_uncertain
 
@@ -35,6 +40,45 @@ HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff",
            "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; "
                                       "img-src 'self' data: blob:; frame-ancestors 'none'"}
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+@dataclass(eq=False)
+class PageContent:
+    """A drive with labels or results, or a running graph.
+
+    session: None to view results without labelling.
+    layers: (i, min_score) -> the answer of /api/labels; None without labels and detections.
+    tracks: returns the JSON objects of the tracks to view.
+    token: every request must contain it.
+    """
+
+    drive: Drive | LiveGraph
+    session: Session | None = None
+    layers: Callable[[int, float], dict[str, Any]] | None = None
+    tracks: Callable[[], Sequence[dict[str, Any]]] = tuple
+    token: str = field(default_factory=partial(secrets.token_urlsafe, 24))
+
+    @property
+    def live(self) -> LiveGraph | None:
+        """The running graph, None for a drive."""
+        return self.drive if isinstance(self.drive, LiveGraph) else None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the answer of /api/drive."""
+        common = {"name": self.drive.name, "mode": "label" if self.session else "view",
+                  "classes": list_classes(), "live": self.live is not None,
+                  "min_score": ScoreParams().get(CLASSES[PEDESTRIAN]),
+                  "can_export": [*FORMATS] if self.session else []}
+        if isinstance(self.drive, LiveGraph):
+            return {**common, "path": "", "layout": "live", "has": [],
+                    "first": self.drive.first, "frames": self.drive.list_frames(),
+                    "status": self.drive.get_status()}
+        poses = (self.session or self.drive).motion.poses
+        frames = [{"name": f.name, "stamp_ns": f.stamp_ns, "sequence": f.sequence,
+                   "pose": None if poses is None else poses[i].ravel().tolist()}
+                  for i, f in enumerate(self.drive.frames)]
+        return {**common, "path": str(self.drive.recording.path), "frames": frames,
+                "layout": self.drive.recording.layout, "has": sorted(self.drive.recording.has)}
 
 
 class Server:
@@ -57,7 +101,7 @@ class Server:
 
     @web.middleware
     async def check_request(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse requests that are not from the page, and turn exceptions into one-line errors."""
+        """Refuse requests from elsewhere, and convert exceptions to one-line errors."""
         host = (request.host or "").rsplit(":", 1)[0]
         given = request.query.get("token") or request.cookies.get(_cookie_name(request)) or ""
         origin = request.headers.get("Origin")
@@ -72,7 +116,7 @@ class Server:
             response = _error_response(400, str(error))
         except web.HTTPException as error:
             response = _error_response(error.status, error.reason)
-        except Exception as error:  # a bug; the labels are as in the journal
+        except Exception as error:  # a bug; the journal still matches the labels
             LOG.exception("%s %s", request.method, request.path)
             response = _error_response(500, f"internal error: {type(error).__name__}: "
                                        f"{shorten_error(error)}")
@@ -106,7 +150,7 @@ class Server:
         return int(text)
 
     async def cloud(self, request: web.Request) -> web.StreamResponse:
-        """Send the points of a frame, and prefetch those around it."""
+        """Send the points of a frame, and prefetch the frames around it."""
         i, drive = self.parse_frame(request.match_info["i"]), self.content.drive
         load_scan = drive.load_scan
         body = await self.run_in_thread(lambda: load_scan(i).encode())
@@ -121,7 +165,7 @@ class Server:
     def _finish_prefetch(self, near: int, made: asyncio.Future[Any]) -> None:
         self.prefetching.discard(near)
         if not made.cancelled():
-            made.exception()  # mark it as retrieved; a request for the frame reports it
+            made.exception()  # marks it as retrieved; a request for the frame reports it
 
     async def run_in_thread(self, work: Callable[[], Any]) -> Any:
         """Run a function outside the event loop and return its result."""
@@ -135,7 +179,7 @@ class Server:
         return self.content.session
 
     async def state(self, request: web.Request) -> web.StreamResponse:
-        """Send all labels, or all tracks of the results."""
+        """Send all labels, or the tracks of the results."""
         if self.content.session is None:
             return web.json_response({"seq": 0, "tracks": list(self.content.tracks())})
         return web.json_response(self.session.to_json())
@@ -149,8 +193,10 @@ class Server:
         return web.json_response({"seq": seq})
 
     async def events(self, request: web.Request) -> web.StreamResponse:
-        """Stream events: actions of all pages, or frames of a running graph. The frames are held
-        while a paused page is connected."""
+        """Stream the actions of all pages, or the frames of a running graph.
+
+        No frames are added while a paused page is connected.
+        """
         socket = web.WebSocketResponse(heartbeat=20.0)
         await socket.prepare(request)
         queue: Events = asyncio.Queue(MAX_QUEUED_EVENTS)
@@ -172,7 +218,7 @@ class Server:
         return socket
 
     def broadcast(self, event: dict[str, Any]) -> None:
-        """Queue an event for all pages; disconnect pages that are too far behind, which makes them
+        """Queue an event for all pages. Disconnect pages that are too far behind, so that they
         reload the state."""
         for queue in list(self.pages):
             try:
@@ -224,7 +270,7 @@ def _parse_number(text: str) -> int | None:
 
 
 def _cookie_name(request: web.Request) -> str:
-    """Return a name with the port: browsers share cookies between the ports of a host."""
+    """Return a name that contains the port, as all ports of a host share their cookies."""
     return f"token_{request.url.port}"
 
 
@@ -249,13 +295,20 @@ async def _send_events(socket: web.WebSocketResponse, queue: Events) -> None:
 
 
 def _notify_in_loop(loop: asyncio.AbstractEventLoop, server: Server, event: dict[str, Any]) -> None:
-    with suppress(RuntimeError):  # the loop is closed: a source outlives the server
+    with suppress(RuntimeError):  # the loop is closed, as a source may outlive the server
         loop.call_soon_threadsafe(server.broadcast, event)
 
 
 async def serve(content: PageContent, port: int, started: Callable[[str], None]) -> None:
-    """Serve until SIGINT or SIGTERM. started: called with the address. InputError if the port is
-    in use."""
+    """Serve until SIGINT or SIGTERM.
+
+    Args:
+        port: 0 for any free port.
+        started: called with the address of the page.
+
+    Raises:
+        InputError: the port is in use.
+    """
     server, loop, end = Server(content), asyncio.get_running_loop(), asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, end.set)

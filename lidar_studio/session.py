@@ -1,7 +1,4 @@
-"""A labelling session: the labels of a drive and everything that can be done to them.
-
-Used by the server and by the simulated annotator.
-"""
+"""A labelling session: the labels of a drive, and the actions of its pages."""
 
 from __future__ import annotations
 
@@ -64,8 +61,11 @@ class AlreadyImportedError(InputError):
 
 
 class Session:
-    """A labelling session; thread-safe. listeners: called with every event of /api/events; busy:
-    progress of the background task, as in `progress` of an event, or None."""
+    """A labelling session; thread-safe.
+
+    listeners: called with every event of /api/events.
+    busy: progress of the background task, for the page; None without a task.
+    """
 
     def __init__(self, drive: Drive, journal: Journal,
                  detector: DetectorChoice | None = DetectorChoice()) -> None:
@@ -74,10 +74,10 @@ class Session:
         self.listeners: list[Listener] = []
         self.busy: dict[str, Any] | None = None
         self.has_proposals = any(line.get("do") == "propose" for line in journal.lines)
-        # cancel events of the running task and of the task that waits for it
+        # Cancel events of the running task, and of the next one, which waits for it to end.
         self._cancelled = self._next_cancelled = threading.Event()
         self._worker: threading.Thread | None = None
-        self._task = ""  # name of the worker's task, "" once it has ended
+        self._task = ""  # the worker's task, "" once it has ended
         self._lock, self._exporting = threading.RLock(), threading.Lock()
         for line in journal.lines:
             self.state, _ = apply(self.state, decode_action(line), drive.motion)
@@ -85,20 +85,23 @@ class Session:
 
     @property
     def motion(self) -> Motion:
-        """Times of the frames, and poses if they are known."""
+        """Times of the frames, and sensor poses if known."""
         return with_scan_poses(self.state, self.drive.motion)
 
     def do(self, action: Mapping[str, Any], by: str = "") -> int:
-        """Do an action of a page and return its number. InputError if it is invalid or cannot be
-        written; nothing has changed then."""
+        """Do an action of a page and return its number.
+
+        Raises:
+            InputError: the action is invalid or cannot be written; the labels are unchanged.
+        """
         if action.get("do") in ("propose", "cancel"):
             return (self.start_proposals(by, True) if action["do"] == "propose"
                     else self.cancel())
         with self._lock:
             seq = self._record(self._complete(_strip_computed(action)), by)
             name = action.get("do")
-            # Undo restores the track from before tracking ended, and a rejected click is not
-            # tracked further, so these actions may leave a click that still has to be tracked.
+            # Undo restores a track from before its tracking ended, and a rejected click is not
+            # tracked further. These actions may therefore leave a click that has to be tracked.
             resumes = name in ("undo", "redo", "accept", "reopen") and not self._task
             if (name == "seed" or resumes) and self._has_waiting_clicks():
                 self._start("following", lambda: self._track_clicks(by, None if resumes else seq))
@@ -111,9 +114,17 @@ class Session:
         return self.state.seq
 
     def start_proposals(self, by: str = "", again: bool = False) -> int:
-        """Start to survey the drive in the background and to propose tracks, if there are no
-        proposals yet or `again`. Return the number of the last action. InputError while this is
-        already running."""
+        """Survey the drive in the background, and propose tracks if there are no proposals yet.
+
+        Args:
+            again: a person requested new proposals.
+
+        Returns:
+            The number of the last action.
+
+        Raises:
+            InputError: proposals are already being made.
+        """
         with self._lock:
             if self._task == "proposing":
                 raise InputError("proposals are already being made")
@@ -131,10 +142,10 @@ class Session:
             if previous is not None:
                 previous.join()
             self.busy = {"what": task, "done": 0, "of": len(self.drive.frames)}
-            self._cancelled = cancelled  # already set if it was cancelled while it waited
+            self._cancelled = cancelled  # may already be set
             try:
                 work()
-            except Exception as error:  # nobody joins this thread, so the page shows the error
+            except Exception as error:  # the page shows it, as nobody joins this thread
                 self.notify({"error": str(error) if isinstance(error, InputError) else
                              f"no proposals: {type(error).__name__}: {shorten_error(error)}"})
             finally:
@@ -147,31 +158,24 @@ class Session:
         self._worker.start()
 
     def wait(self) -> None:
-        """Wait until the background task has ended."""
+        """Wait for the background task to end."""
         if self._worker is not None:
             self._worker.join()
 
-    def propose(self, by: str = "", in_process: bool = False,
-                on_progress: Callable[[int], object] = lambda count: None, again: bool = True,
-                by_person: bool = False) -> None:
-        """Survey the drive if that was not done yet, and record proposals; nothing if cancelled.
+    def propose(self, by: str = "", again: bool = True, by_person: bool = False) -> None:
+        """Survey the drive if necessary, and record proposals unless cancelled.
 
         Args:
-            in_process: survey in this process instead of a separate one.
-            on_progress: called with the number of surveyed frames.
             again: if False, make proposals only when a click has still to be tracked.
-            by_person: a person requested it and can undo it.
+            by_person: a person requested the proposals and can undo them.
 
         Raises:
             InputError: a frame or the weights cannot be read.
         """
-        def report(count: int) -> bool:
-            on_progress(count)
-            return self._report_progress(count)
         self.proposer.load_cached()
         self._report_problem()
         if self.proposer.surveys is None:
-            complete = self.proposer.run_survey(report, in_process)
+            complete = self.proposer.run_survey(self._report_progress)
             self._report_problem()
             if not complete:
                 return
@@ -187,15 +191,18 @@ class Session:
             self.proposer.problem = ""
 
     def _report_progress(self, count: int) -> bool:
-        """Report the number of finished frames; return False if the task is cancelled."""
+        """Report the number of finished frames. Return False to cancel the task."""
         if self.busy is not None:
             self.busy = {**self.busy, "done": count}
             self.notify({"progress": self.get_progress()})
         return not self._cancelled.is_set()
 
     def _propose_all(self, by: str, seed: int | None, by_person: bool = False) -> None:
-        """Make proposals for the whole drive and record them. If the action number `seed` is still
-        the last one, they become part of that action. Other actions may happen meanwhile."""
+        """Make proposals for the whole drive and record them.
+
+        Other actions may be recorded in the meantime. If action number `seed` is still the last
+        one, the proposals become part of it.
+        """
         state = self.state
         found = self.proposer.make_proposals(state, self.motion, None, self._report_progress)
         with self._lock:
@@ -219,7 +226,7 @@ class Session:
         return any(t.nearby and t.awaits_tracking for t in self.state.tracks.values())
 
     def _complete(self, action: Action) -> Action:
-        """Return the action with everything that is computed for it."""
+        """Add the computed fields to an action."""
         name = action.get("do")
         if name == "seed":
             return self._complete_seed(action)
@@ -238,22 +245,24 @@ class Session:
     def _complete_import(self, action: Action) -> Action:
         path, name = action.get("path"), action.get("format") or ""
         if not isinstance(path, str) or not isinstance(name, str):
-            raise InputError("an import needs the path of labels, and may name their format")
+            raise InputError("an import needs the path of a label file or folder, and optionally a "
+                             "format, as text")
         labels = import_labels(Path(path), name or recognise_format(Path(path)), self.drive.frames)
         tracks, kept = to_tracks(labels, self.state.next_id)
         before = self.state.kept
         digest, imports = compute_digest(tracks, kept), before.get("imports", [])
         if digest in imports:
-            raise AlreadyImportedError(f"the labels of {path} were already imported; nothing was "
+            raise AlreadyImportedError(f"the labels in {path} were already imported; nothing was "
                                        "done")
         return {**action, "tracks": tracks,
                 "kept": {**join_extras(before, kept), "imports": [*imports, digest]}}
 
     def export(self, format_name: str, out: str, force: bool = False) -> dict[str, Any]:
-        """Write the accepted tracks in a format of exchange.FORMATS.
+        """Export the accepted tracks.
 
         Args:
-            out: a path; relative ones are in the journal's folder.
+            format_name: a key of exchange.FORMATS.
+            out: path, relative to the journal's folder.
             force: replace existing files.
 
         Returns:
@@ -294,7 +303,7 @@ class Session:
         is_long = count > 2 * NEARBY_FRAMES
         found = self.proposer.make_proposals(state, self.motion, nearby if is_long else None)
         tracks, removed = merge_proposals(state, found or [], self.motion)
-        if is_long:  # proposals for the nearby frames cannot replace tracks of the whole drive
+        if is_long:  # proposals in nearby frames must not replace tracks of the whole drive
             tracks = [t for t in tracks if t.id == track.id or t.id not in state.tracks]
             removed = []
         own = next((t for t in tracks if t.id == track.id), track)
@@ -340,30 +349,30 @@ class Session:
                      "removed": removed, **self.summarize()})
 
     def notify(self, event: dict[str, Any]) -> None:
-        """Call all listeners with an event."""
+        """Send an event to all listeners."""
         for listener in list(self.listeners):
             listener(event)
 
     def get_progress(self) -> dict[str, Any]:
-        """Counts of tracks and frames, and the state of the background task."""
+        """Return counts of tracks and frames, and the progress of the background task."""
         return {**count_progress(self.state, len(self.drive.frames)), "busy": self.busy}
 
     def summarize(self) -> dict[str, Any]:
-        """The state without the tracks, as in every event."""
+        """Return the part of the state that every event contains: all but the tracks."""
         state = self.state
         return {"checked": sorted(state.checked), "seeds": [list(s) for s in state.seeds],
                 "can_undo": state.undo_stack is not None,
                 "can_redo": state.redo_stack is not None, "progress": self.get_progress()}
 
     def to_json(self) -> dict[str, Any]:
-        """The answer of /api/state."""
+        """Return the answer of /api/state."""
         with self._lock:
             return {"seq": self.state.seq, **self.summarize(),
                     "tracks": [track_to_json(t) for t in self.state.tracks.values()]}
 
 
 def _strip_computed(action: Mapping[str, Any]) -> Action:
-    """Remove the fields that the session computes, which a page must not set."""
+    """Remove the fields that only the session may set."""
     if action.get("do") == "poses":
         raise InputError("poses come from the drive")
     computed = {"seed": ("track", "tracks", "removed"), "propose": ("tracks", "removed"),
@@ -376,8 +385,11 @@ def _strip_computed(action: Mapping[str, Any]) -> Action:
 @contextmanager
 def open_session(drive: Drive, folder: Path,
                  detector: DetectorChoice | None = DetectorChoice()) -> Iterator[Session]:
-    """Open the labels of a drive in a folder, as its journal left them. InputError for the journal
-    of another drive, and while another process has it open."""
+    """Open the labels of a drive that are stored in a folder, or start new ones.
+
+    Raises:
+        InputError: the journal belongs to another drive, or another process uses it.
+    """
     with open_journal(folder, drive.journal_header) as journal:
         session = Session(drive, journal, detector)
         session.proposer.load_cached()

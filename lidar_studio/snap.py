@@ -1,4 +1,4 @@
-"""Fitting of boxes to points: around a cluster, onto the ground, to a given size."""
+"""Fitting of boxes to points: to a cluster, to the ground, to a given size."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from lidar_studio.drive import Scan
 
 Array = np.ndarray[Any, Any]
 BOX_MARGIN_M = 0.3            # around a box, when searching its cluster
-MIN_GROUND_POINTS = 20        # nearest ground points, used if there are none below the box,
-MAX_GROUND_DISTANCE_M = 15.0  # and how far away they may be
+# Without ground points below a box, this many of the nearest ones are used, up to this distance.
+MIN_GROUND_POINTS, MAX_GROUND_DISTANCE_M = 20, 15.0
 MIN_PIECE_SHARE = 0.2         # of the largest cluster in a box; smaller ones are other objects
-PIECE_REACH = 0.55            # of the usual length: range around a click with parts of a vehicle
-MIN_INSIDE_SHARE = 0.8        # of a cluster's points in that range, to be such a part
+# A cluster is part of a clicked vehicle if this share of its points is within this share of the
+# usual length from the click.
+MIN_INSIDE_SHARE, PIECE_REACH = 0.8, 0.55
 MIN_REACH_M = 0.1             # beyond the point of a cluster nearest to the click
 MAX_LENGTH_RATIO = 1.5        # to the usual length; a longer cluster contains other objects
-LONG_OBJECT_M = 2.5           # usual length from which the far side is hidden
-MAX_END_RATIO = 1.3           # to the width; a side up to this is the front or the rear
+LONG_OBJECT_M = 2.5           # usual length of objects whose far side is hidden
+MAX_END_RATIO = 1.3           # to the usual width; a shorter side is the front or the rear
 
 
 def fit_clicked_box(scan: Scan, click: Array, class_name: str) -> Array:
-    """Return the box (7,) of the cluster at a point (3,), on the ground and at least as large as
-    is usual for the class. InputError if there is no cluster near the point."""
+    """Fit a box (7,) to the cluster at a point (3,): on the ground, at least of the class's usual
+    size. InputError if there is no cluster near the point."""
     label = find_clicked_cluster(click, scan.xyz, scan.cluster_ids, SeedParams().click_radius)
     members = scan.cluster_ids == label
     usual = find_usual_size(class_name)
@@ -50,7 +51,7 @@ def fit_clicked_box(scan: Scan, click: Array, class_name: str) -> Array:
 
 
 def snap_to_cluster(scan: Scan, box: Array) -> Array:
-    """Return the L-shape (7,) of the cluster in a box (7,), with the heading nearest to the box's.
+    """Fit an L-shape (7,) to the cluster in a box (7,), keeping the heading within 45 degrees.
     InputError if there is no cluster in the box."""
     near = points_in_box(scan.xyz, box, BOX_MARGIN_M) & (scan.cluster_ids > 0)
     counts = np.bincount(scan.cluster_ids[near], minlength=scan.cluster_ids.max(initial=0) + 1)
@@ -61,8 +62,7 @@ def snap_to_cluster(scan: Scan, box: Array) -> Array:
 
 
 def snap_to_ground(scan: Scan, box: Array) -> Array:
-    """Return the box (7,) moved vertically onto the ground. InputError if no ground is visible
-    there."""
+    """Move a box (7,) vertically onto the ground. InputError if no ground is visible there."""
     floor = _find_ground_height(scan, box)
     if not np.isfinite(floor):
         raise InputError("no ground points around the box; move it by hand")
@@ -70,8 +70,7 @@ def snap_to_ground(scan: Scan, box: Array) -> Array:
 
 
 def _find_ground_height(scan: Scan, box: Array) -> float:
-    """Return the z of the ground under a box (7,), else of the nearest ground points; NaN if those
-    are too far away."""
+    """Return the z of the ground below a box (7,), else of the nearest ground points, else NaN."""
     ground = scan.xyz[scan.ground]
     floor = float(fit_ground_heights(ground, box[None, :2])[0])
     if np.isfinite(floor) or len(ground) < MIN_GROUND_POINTS:
@@ -84,33 +83,34 @@ def _find_ground_height(scan: Scan, box: Array) -> float:
 
 
 def resize_box(box: Array, size: Array) -> Array:
-    """Return the box (7,) with another length, width and height (3,); the corner nearest to the
-    sensor and the bottom stay in place."""
+    """Resize a box (7,) to length, width and height (3,); the bottom and the corner nearest to the
+    sensor stay in place."""
     cos, sin = np.cos(box[6]), np.sin(box[6])
-    seen = to_box_frame(np.zeros((1, 3)), box)[0, :2]
-    away = -np.where(np.abs(seen) > box[3:5] / 2, np.sign(seen), 0.0)
+    sensor = to_box_frame(np.zeros((1, 3)), box)[0, :2]
+    away = -np.where(np.abs(sensor) > box[3:5] / 2, np.sign(sensor), 0.0)
     along, across = away * (size[:2] - box[3:5]) / 2
     return np.array([box[0] + cos * along - sin * across, box[1] + sin * along + cos * across,
                      box[2] + (size[2] - box[5]) / 2, *size, box[6]])
 
 
 def align_heading(box: Array, yaw: float) -> Array:
-    """Return the same box (7,) in the one of its four equivalent forms whose yaw is nearest."""
+    """Turn the heading of a box (7,) by a multiple of 90 degrees towards a yaw, and swap its sides
+    accordingly, so that it covers the same volume."""
     turns = round(float(wrap_angle(yaw - box[6])) / (np.pi / 2))
     sides = box[3:5] if turns % 2 == 0 else box[[4, 3]]
     return np.array([*box[:3], *sides, box[5], wrap_angle(box[6] + turns * np.pi / 2)])
 
 
 def find_usual_size(class_name: str) -> Size | None:
-    """Return the mean size of a detected class; None for other classes."""
+    """Return the mean size of a class; None if it is not a detected class."""
     return DETECTED[class_name].mean_size if class_name in DETECTED else None
 
 
 def complete_box(box: Array, usual: Size | None) -> Array:
     """Enlarge the box (7,) of visible points to the usual size of the class.
 
-    Boxes of people grow evenly. Those of vehicles grow away from the sensor, and a longer side up
-    to MAX_END_RATIO times the usual width is taken as the width.
+    Boxes of people grow evenly, those of vehicles away from the sensor. If the length of a vehicle
+    is less than MAX_END_RATIO times the usual width, only its front or rear is visible.
     """
     if usual is None:
         return box
@@ -126,7 +126,7 @@ def complete_box(box: Array, usual: Size | None) -> Array:
 
 
 def _fit_box(scan: Scan, members: Array) -> Array:
-    """Return the L-shape (7,) around the selected points (N,) bool, down to the ground."""
+    """Fit an L-shape (7,) to the selected points (N,) bool, down to the ground."""
     xyz = scan.xyz[members]
     box = fit_boxes(xyz, np.ones(len(xyz), np.int32), "l_shape")[0].astype(np.float64)
     floor = _find_ground_height(scan, box)

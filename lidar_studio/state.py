@@ -1,6 +1,6 @@
 """Immutable state of a labelling session: tracks of boxes, seeds, checked frames, undo history.
 
-actions.py computes the next state. Each box is in the LiDAR frame of its frame.
+Boxes are in the LiDAR frame of their scan. actions.py computes the next state.
 """
 
 from __future__ import annotations
@@ -14,12 +14,11 @@ import numpy as np
 
 KEY, PROPOSED, INTERPOLATED = "key", "proposed", "interpolated"  # kinds of boxes
 ACCEPTED, REJECTED = "accepted", "rejected"                      # of tracks, as is PROPOSED
-CLICK = "click"  # source of a track that a person clicked; it is then tracked through the drive
+CLICK = "click"  # source of a clicked track, which is then tracked through the drive
 
 
 class Box(NamedTuple):
-    """[x y z l w h yaw] and its kind: KEY (set by a person), PROPOSED or INTERPOLATED (between key
-    boxes)."""
+    """[x y z l w h yaw]; KEY (set by a person), PROPOSED or INTERPOLATED (between key boxes)."""
 
     values: tuple[float, ...]
     kind: str
@@ -35,10 +34,10 @@ class Track:
     """One object over the frames of a drive.
 
     boxes: by frame.
-    gone: frames from which a person removed the box.
-    extra: by frame, further fields of an imported label, which are exported again.
+    removed_frames: frames from which a person removed the box.
+    extra: by frame, fields of an imported label that are preserved for export.
     edited: a person changed the class, or split or merged the track.
-    nearby: it was clicked, and so far tracked only through the frames around the click.
+    nearby: it was clicked, and is so far tracked only through the frames around the click.
     """
 
     id: int
@@ -47,20 +46,20 @@ class Track:
     score: float = 1.0
     source: str = CLICK
     boxes: Mapping[int, Box] = field(default_factory=dict)
-    gone: frozenset[int] = frozenset()
+    removed_frames: frozenset[int] = frozenset()
     extra: Mapping[int, Any] = field(default_factory=dict)
     edited: bool = False
     nearby: bool = False
 
     @property
     def has_human_edits(self) -> bool:
-        """True if a person decided on the track or changed it."""
-        return (self.state != PROPOSED or self.edited or bool(self.gone)
+        """True if a person accepted, rejected or changed the track."""
+        return (self.state != PROPOSED or self.edited or bool(self.removed_frames)
                 or any(box.kind == KEY for box in self.boxes.values()))
 
     @property
     def awaits_tracking(self) -> bool:
-        """True for a clicked track that was not yet tracked through the whole drive."""
+        """True for a clicked track that is not yet tracked through the whole drive."""
         return (self.source == CLICK and self.state != REJECTED and not self.edited
                 and (len(self.boxes) == 1 or self.nearby))
 
@@ -76,7 +75,7 @@ class Track:
 
 class Change(NamedTuple):
     """Values before and after an action: tracks by id (None if absent), seeds, checked frames, and
-    the extras of imported files."""
+    preserved fields of imported files."""
 
     tracks: Mapping[int, tuple[Track | None, Track | None]]
     seeds: tuple[Seeds, Seeds]
@@ -98,7 +97,7 @@ class Change(NamedTuple):
 
 
 Seeds = tuple[tuple[int, int], ...]    # (frame, track id)
-Kept = Mapping[str, Any]               # "notes" by frame, "extra": see label_conversion.py
+Kept = Mapping[str, Any]  # preserved fields of imported files, see label_conversion.py
 Stack = tuple[Change, Any] | None      # a change, and the stack below it: shared between states
 
 
@@ -107,9 +106,9 @@ class State:
     """The labels after an action.
 
     seq: number of that action.
-    next_id: an id that no track has had yet.
-    kept: extras of imported files.
-    poses: (F, 16) of the sensor, from scan matching, if the recording has none.
+    next_id: id of the next new track.
+    kept: preserved fields of imported files.
+    poses: (F, 16) sensor poses from scan matching, if the recording has none.
     """
 
     tracks: Mapping[int, Track] = field(default_factory=dict)
@@ -123,7 +122,7 @@ class State:
     redo_stack: Stack = None
 
     def with_change(self, change: Change) -> State:
-        """Return the state with the change applied; undo and redo stacks stay as they are."""
+        """Return the state after a change, with the same undo and redo stacks."""
         tracks = dict(self.tracks)
         for number, (_, track) in change.tracks.items():
             if track is None:
@@ -141,8 +140,8 @@ def track_to_json(track: Track) -> dict[str, Any]:
              "score": track.score, "source": track.source,
              "boxes": [[f, *b.values, b.kind] for f, b in sorted(track.boxes.items())],
              "uncertainty": track.uncertainty}
-    if track.gone:
-        found["gone"] = sorted(track.gone)
+    if track.removed_frames:
+        found["gone"] = sorted(track.removed_frames)
     if track.extra:
         found["extra"] = {str(f): track.extra[f] for f in sorted(track.extra)}
     return found | {name: True for name in ("edited", "nearby") if getattr(track, name)}
@@ -160,10 +159,9 @@ def track_from_json(found: Mapping[str, Any]) -> Track:
 
 def find_next_uncertain(state: State, after: int | None = None,
                         condition: Callable[[Track], bool] = lambda track: True) -> Track | None:
-    """Return the most uncertain proposed track that meets a condition.
+    """Return the most uncertain proposed track that meets a condition, or None.
 
-    With the id of such a track in `after`, return the next one, wrapping around at the end. Ties
-    are ordered by id. None if there is no such track.
+    after: id of such a track; the one after it is returned, and after the last one the first.
     """
     waiting = sorted((t for t in state.tracks.values() if t.state == PROPOSED and condition(t)),
                      key=lambda t: (-t.uncertainty, t.id))
@@ -174,7 +172,7 @@ def find_next_uncertain(state: State, after: int | None = None,
 
 
 def count_progress(state: State, frames: int) -> dict[str, int]:
-    """Count tracks by state, checked frames and actions, as the page shows them."""
+    """Count tracks by state, checked frames and actions, for the page."""
     states = [t.state for t in state.tracks.values()]
     accepted, rejected = states.count(ACCEPTED), states.count(REJECTED)
     return {"tracks": len(states), "accepted": accepted, "rejected": rejected,

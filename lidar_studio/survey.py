@@ -1,5 +1,7 @@
-"""Survey of a drive: detections and candidate clusters of every frame, computed once, so that
-proposals for a further seed are fast."""
+"""Survey of a drive: detections and candidate clusters of every frame.
+
+It is computed once, so that a new seed needs only a comparison.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ from lidar_perception.types import Detections
 from lidar_studio.drive import Drive, make_pipeline_params, select_drive
 
 Array = np.ndarray[Any, Any]
-MIN_DETECTION_SCORE = 0.1    # low, as tracking filters weak detections
+MIN_DETECTION_SCORE = 0.1    # low, as the tracker filters weak detections
 PERSON_HEIGHTS_M = 0.9, 2.4  # above the ground
 MAX_PERSON_WIDTH_M = 2.0     # diagonal of the cluster in BEV
 MIN_PERSON_POINTS = 5
@@ -38,12 +40,12 @@ MIN_OBJECT_POINTS = 10
 
 @dataclass(frozen=True)
 class FrameSurvey:
-    """Survey of one frame: detections, clusters that may be people, and clusters of any object.
+    """Survey of one frame.
 
     boxes: (C, 7) of clusters that may be people, down to the ground.
-    images: (C, 80) uint32, their silhouettes.
-    features: by name, (C,) each; empty for C = 0.
-    shapes: (T, 7) L-shapes of clusters of any object, down to the ground.
+    images: (C, 80) uint32, silhouettes of these clusters.
+    features: (C,) each, by name; empty for C = 0.
+    shapes: (T, 7) L-shapes of clusters of object size, down to the ground.
     pose: (4, 4) in the first frame, from scan matching; None if the drive has poses.
     """
 
@@ -57,8 +59,15 @@ class FrameSurvey:
 
 def survey_frame(frame: Frame, detector: Detector | None = None,
                  odometry: Odometry | None = None) -> FrameSurvey:
-    """Survey a frame. Without a detector there are no detections, and without odometry, which
-    needs all frames in order, there is no pose. InputError if the frame cannot be read."""
+    """Survey a frame.
+
+    Args:
+        detector: None for no detections.
+        odometry: gives the pose; it needs all frames in order. None for no pose.
+
+    Raises:
+        InputError: the frame cannot be read.
+    """
     cloud, params = frame.load(), make_pipeline_params(frame)
     found = segment_cloud(cloud, None, params)
     detections = Detections.none() if detector is None else detector(cloud).detections
@@ -75,7 +84,7 @@ def survey_frame(frame: Frame, detector: Detector | None = None,
 
 def _find_clusters(boxes: Array, counts: Array, heights: tuple[float, float], max_diagonal: float,
                    min_points: int) -> Array:
-    """Return the indices of clusters of a size, (K,) int."""
+    """Return the indices (K,) int of clusters within these limits."""
     return np.flatnonzero((boxes[:, 5] >= heights[0]) & (boxes[:, 5] <= heights[1])
                           & (np.hypot(boxes[:, 3], boxes[:, 4]) <= max_diagonal)
                           & (counts >= min_points))
@@ -101,21 +110,19 @@ def _describe_people(xyz: Array, cluster_ids: Array, boxes: Array, numbers: Arra
     return images, compute_shape_features(points, start, boxes, params)
 
 
-def survey_drive(drive: Drive, choice: DetectorChoice | None, in_process: bool = False,
+def survey_drive(drive: Drive, choice: DetectorChoice | None,
                  first: int = 0) -> Generator[FrameSurvey | None, None, None]:
     """Yield the surveys of all frames from `first` on, in order.
 
-    Args:
-        choice: the detector, or None.
-        in_process: run in this process, not in a separate one that ends with the iterator.
-        first: for earlier frames, None is yielded if scan matching has to read them again.
+    The frames are surveyed in a separate process if the recording can be reopened there; it ends
+    with the iterator. Scan matching has to read earlier frames again; None is yielded for these.
 
     Raises:
         InputError: a frame or the detector's weights cannot be read.
     """
     reopen = drive.recording.reopen
     frames = list(range(0 if _needs_odometry(drive) else first, len(drive.frames)))
-    if in_process or reopen is None:
+    if reopen is None:
         yield from map(_make_surveyor(drive, choice, first), frames)
         return
     sequence = drive.frames[0].sequence
@@ -144,5 +151,5 @@ def _make_surveyor(drive: Drive, choice: DetectorChoice | None,
 
 def _make_process_surveyor(reopen: Callable[[], Recording], choice: DetectorChoice | None,
                            sequence: str, first: int) -> Callable[[int], FrameSurvey | None]:
-    os.nice(10)  # the page comes first
+    os.nice(10)  # so that the page stays responsive
     return _make_surveyor(select_drive(reopen(), sequence), choice, first)

@@ -1,4 +1,4 @@
-"""Cache of a drive's survey on disk, so that a restarted server can use it or continue it."""
+"""Cache of a drive's survey on disk, which a restarted server uses or continues."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ PARTS = "detections", "classes", "scores", "boxes", "images", "features", "thing
 
 
 def make_key(drive: Drive, choice: DetectorChoice | None) -> str:
-    """Return a JSON string of everything that a survey depends on: the drive, the detector with its
-    weights and parameters, and the version of the package."""
+    """Return the inputs of a survey as JSON: the drive, the detector's weights and parameters, and
+    the version of the package."""
     weights = "" if choice is None else choice.weights
     file = Path(weights)
     parameters = {} if choice is None else {
@@ -49,8 +49,14 @@ def clear(folder: Path) -> None:
 
 
 def write(folder: Path, key: str, first: int, surveys: Sequence[FrameSurvey]) -> None:
-    """Write one file of the cache: FRAMES_PER_FILE surveys from frame `first` on, fewer at the end
-    of the drive. InputError if it cannot be written or the cache is too large."""
+    """Write one file of the cache, with the surveys from frame `first` on.
+
+    Args:
+        surveys: FRAMES_PER_FILE, or fewer at the end of the drive.
+
+    Raises:
+        InputError: it cannot be written, or the cache is too large.
+    """
     columns: list[list[Array]] = [[] for _ in PARTS]
     names = sorted({name for survey in surveys for name in survey.features})
     for survey in surveys:
@@ -80,7 +86,7 @@ def _file_name(first: int) -> str:
 
 
 def read(folder: Path, key: str) -> tuple[list[FrameSurvey], str]:
-    """Return the cached surveys from the first frame on, and why files were ignored, or ""."""
+    """Return the cached surveys of the first frames, and why the others were ignored, or ""."""
     surveys: list[FrameSurvey] = []
     first = 0
     while (path := folder / _file_name(first)).is_file():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,19 +12,16 @@ from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import (
     browser_option,
     data_argument,
-    json_option,
     open_and_describe,
     out_folder,
     port_option,
-    write_json,
 )
 from lidar_perception.cli.options import detector_options
 from lidar_perception.detectors.open import DetectorChoice
-from lidar_perception.runs.terminal import console, errors, make_progress, show_scanning
+from lidar_perception.runs.terminal import console, errors, show_scanning
 from lidar_perception.types import InputError
 
 if TYPE_CHECKING:
-    from lidar_perception.data.frame import Recording
     from lidar_studio.drive import Drive
     from lidar_studio.session import Session
 
@@ -47,12 +43,8 @@ if TYPE_CHECKING:
 @click.option("--export", "exports", metavar="FORMAT:PATH", help="Write the accepted tracks of the "
               "journal to PATH and exit.")
 @click.option("--force", is_flag=True, help="With --export: replace existing files.")
-@click.option("--simulate-annotator", is_flag=True, help="Let a script that knows the ground truth "
-              "label each drive of DATA, and count its clicks, keys and drags.")
-@json_option
 def label(data: Path, sequence: str | None, out: Path | None, detector: DetectorChoice,
-          imports: tuple[str, ...], exports: str | None, force: bool,
-          simulate_annotator: bool, json_file: Path | None, **page: Any) -> None:
+          imports: tuple[str, ...], exports: str | None, force: bool, **page: Any) -> None:
     """Label a drive on a page in the browser: click, accept, correct.
 
     Every action is saved to FOLDER/journal.jsonl immediately; Ctrl-C stops the server.
@@ -70,9 +62,6 @@ def label(data: Path, sequence: str | None, out: Path | None, detector: Detector
     sources = [_split_format_and_path("--import", text) for text in imports]
     target = None if exports is None else _split_format_and_path("--export", exports)
     recording = open_and_describe(data)
-    if simulate_annotator:
-        write_json(json_file, _simulate_annotator(recording, sequence, detector))
-        return
     with show_scanning(data):
         drive = select_drive(recording, sequence)
     if target is None:
@@ -114,9 +103,8 @@ def _serve(drive: Drive, session: Session, port: int, browser: bool, propose: bo
     import asyncio
     import webbrowser
 
-    from lidar_studio.page_content import PageContent
     from lidar_studio.results import Results
-    from lidar_studio.server import serve
+    from lidar_studio.server import PageContent, serve
 
     count = session.state.seq
 
@@ -131,38 +119,3 @@ def _serve(drive: Drive, session: Session, port: int, browser: bool, propose: bo
             webbrowser.open(url)
     layers = Results().bind_layers(drive) if show_labels else None
     asyncio.run(serve(PageContent(drive, session, layers), port, started))
-
-
-def _simulate_annotator(recording: Recording, sequence: str | None,
-                        detector: DetectorChoice) -> dict[str, Any]:
-    from lidar_perception.data.frame import BOXES
-    from lidar_studio.annotator import Annotator, sum_results
-    from lidar_studio.drive import select_drive
-    from lidar_studio.session import open_session
-
-    recording.require(BOXES, "label --simulate-annotator")
-    found: dict[str, Any] = {}
-    with show_scanning(recording.path):
-        names = dict.fromkeys(frame.sequence for frame in recording)
-    for name in names if sequence is None else [sequence]:
-        drive = select_drive(recording, name)
-        with (tempfile.TemporaryDirectory() as folder,
-              open_session(drive, Path(folder), detector) as session):
-            _propose_with_progress(drive, session)
-            found[drive.name] = done = Annotator(session).run()
-        console.print(f"{drive.name}: {done['people']} pedestrians, {done['boxes']} boxes: "
-                      f"{done['actions']} actions, {done['looked_at']} proposals looked at; by "
-                      f"hand {done['by_hand']}, without tracks {done['without_tracks']}")
-    if not any(done["boxes"] for done in found.values()):
-        raise InputError(f"{recording.path} has no labelled pedestrians; give another drive")
-    sums = sum_results(found)
-    console.print(f"all: {sums['actions']} actions, {sums['share_of_by_hand']:.0%} of those by "
-                  f"hand; {sums['share_corrected_in_full']:.0%} if size and heading are corrected "
-                  f"too; without tracks {sums['share_without_tracks']:.0%}")
-    return {"data": str(recording.path), "drives": found, "all": sums}
-
-
-def _propose_with_progress(drive: Drive, session: Session) -> None:
-    with make_progress() as bar:
-        task = bar.add_task(f"{drive.name}: proposing tracks", total=len(drive.frames))
-        session.propose(on_progress=lambda count: bar.update(task, completed=count))

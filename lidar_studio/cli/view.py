@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ from lidar_perception.runs.terminal import console, show_scanning
 from lidar_perception.types import InputError
 
 if TYPE_CHECKING:
-    from lidar_studio.page_content import PageContent
+    from lidar_studio.server import PageContent
 
 WEIGHTS = (".safetensors", ".onnx", ".json")
 
@@ -42,47 +43,43 @@ WEIGHTS = (".safetensors", ".onnx", ".json")
               "several.")
 @port_option
 @browser_option
-@click.option("--screenshot", type=click.Path(path_type=Path), metavar="PNG", help="Write a "
-              "screenshot of the page and exit; needs chromium.")
 @click.option("--frame", type=click.IntRange(0), default=0, show_default=True, metavar="N",
               help="First frame to show.")
 @click.option("--theme", type=Choice(["auto", "light", "dark"]), default="auto",
               show_default=True, help="Colours of the page.")
 def view(data: Path | None, live: bool, detectors: tuple[DetectorChoice, ...],
          results: tuple[Path, ...], points: str | None, detections: tuple[str, ...],
-         namespace: str, sequence: str | None, port: int, browser: bool, screenshot: Path | None,
-         frame: int, theme: str) -> None:
+         namespace: str, sequence: str | None, port: int, browser: bool, frame: int,
+         theme: str) -> None:
     """Show a recording and its results on a page in the browser: clouds with ground and
     clusters, labels, detections by source and score, missed and false ones, tracks. DATA is a
-    bag, such as the result bag of the demo, or the folder of a data set; --live shows the nodes
-    that run on this ROS_DOMAIN_ID, always at the newest frame.
+    bag, such as the result bag of the demo, or the folder of a data set; --live shows the newest
+    frame of the nodes that run on this ROS_DOMAIN_ID.
 
     \b
     Examples:
       lidar-perception view out/demo/result
       lidar-perception view /data/kitti/tracking --sequence 0000 --weights fused
       lidar-perception view drive.bag --weights fused
-      lidar-perception view /data/kitti/object --results out/data --screenshot frame.png --frame 12
+      lidar-perception view /data/kitti/object --results out/data --frame 12
       lidar-perception view --live --namespace front
     """
     import asyncio
     import webbrowser
 
-    from lidar_studio.screenshot import write_screenshot
     from lidar_studio.server import serve
 
     if (data is None) != live:
         raise click.UsageError("give DATA, the path of a recording, or --live")
-    excluded = {"--weights": detectors, "--results": results, "--sequence": sequence,
-                "--screenshot": screenshot} if live else {"--detections": detections,
-                                                          "--namespace": namespace}
+    excluded = ({"--weights": detectors, "--results": results, "--sequence": sequence} if live
+                else {"--detections": detections, "--namespace": namespace})
     if given := [name for name, value in excluded.items() if value]:
         raise click.UsageError(f"{', '.join(given)}: {'not with' if live else 'only with'} --live")
 
     def started(url: str) -> None:
         url += f"&frame={frame}&theme={theme}"
         console.print(url)
-        if screenshot is None and browser:
+        if browser:
             webbrowser.open(url)
     if data is None:
         with _open_live_content(namespace, points or "", detections) as content:
@@ -91,21 +88,16 @@ def view(data: Path | None, live: bool, detectors: tuple[DetectorChoice, ...],
     content = _open_content(data, detectors, results, points, sequence)
     if frame >= content.drive.end:
         raise InputError(f"{data} has no frame {frame}; it has {content.drive.end}")
-    if screenshot is None:
-        asyncio.run(serve(content, port, started))
-    else:
-        asyncio.run(write_screenshot(content, screenshot, f"frame={frame}&theme={theme}"))
-        console.print(f"{screenshot}")
+    asyncio.run(serve(content, port, started))
 
 
 @contextmanager
 def _open_live_content(namespace: str, points: str,
                        detections: tuple[str, ...]) -> Iterator[PageContent]:
-    """Receive a running graph while the context is open."""
     from lidar_perception.nodes import require_rclpy
     from lidar_perception.nodes.shared_memory import is_fed_by_driver, use_large_shared_memory
     from lidar_studio.live_graph import LiveGraph
-    from lidar_studio.page_content import PageContent
+    from lidar_studio.server import PageContent
 
     require_rclpy()
     use_large_shared_memory(points != "" and is_fed_by_driver([points]))
@@ -123,7 +115,7 @@ def _open_content(path: Path, detectors: tuple[DetectorChoice, ...], results: tu
     from lidar_perception.data.open import split_topic
     from lidar_studio import results as result_sources
     from lidar_studio.drive import require_clouds, select_drive
-    from lidar_studio.page_content import PageContent
+    from lidar_studio.server import PageContent
 
     path, topic = split_topic(path)
     is_bag = path.exists() and is_layout(path)
@@ -137,7 +129,7 @@ def _open_content(path: Path, detectors: tuple[DetectorChoice, ...], results: tu
     require_clouds(drive)
     found = result_sources.Results()
     if is_bag:
-        drive = result_sources.use_recorded_scans(drive)
+        drive = replace(drive, scan=result_sources.read_recorded_scan)
         found = result_sources.read_recorded_results(recording.frames.poses,
                                                      [f.stamp_ns for f in drive.frames])
     height = drive.frames[0].sensor_height
@@ -151,8 +143,8 @@ def _open_content(path: Path, detectors: tuple[DetectorChoice, ...], results: tu
 
 
 def make_short_names(paths: list[Path], taken: Collection[str] = ()) -> list[str]:
-    """Make unique names for files or folders: the shortest end of each path that differs from those
-    of the other paths and from the names in `taken`, else the whole path."""
+    """Return a unique short name for each path: its shortest end that is not the end of another one
+    and not in `taken`, else the whole path."""
     parts = [path.with_suffix("").parts if path.suffix in WEIGHTS else path.parts for path in paths]
     names = []
     for i, own in enumerate(parts):

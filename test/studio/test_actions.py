@@ -102,7 +102,7 @@ def test_replaying_the_lines_gives_the_same_state(actions, motion):
         assert track_from_json(json.loads(json.dumps(track_to_json(track)))) == track
         assert all(np.isfinite(b.values).all() and min(b.values[3:6]) > 0
                    for b in track.boxes.values())
-        assert not track.gone & track.boxes.keys()
+        assert not track.removed_frames & track.boxes.keys()
 
 
 @given(st.lists(ACTIONS, max_size=25), st.sampled_from([STANDING, DRIVING]))
@@ -225,7 +225,8 @@ def test_frame_emptied_by_a_person_stays_empty():
 @given(st.sets(frames, min_size=2), st.integers(1, FRAMES - 1))
 def test_split_and_merge_are_inverses(there, cut):
     true = walking((5.0, 3.0), (1.0, 0.5), DRIVING, PROPOSED)
-    track = Track(1, "Pedestrian", boxes={f: true[f] for f in there}, gone=frozenset({0}) - there)
+    track = Track(1, "Pedestrian", boxes={f: true[f] for f in there},
+                  removed_frames=frozenset({0}) - there)
     state = State({1: track}, seeds=((min(there), 1), (max(there), 1)), next_id=2)
     try:
         parts, _ = apply(state, {"do": "split", "track": 1, "frame": cut}, DRIVING)
@@ -249,7 +250,7 @@ def test_trim_keeps_the_same_boxes_as_split():
     parts, _ = apply(state, {"do": "split", "track": 1, "frame": 4}, DRIVING)
     assert early.tracks[1].boxes == parts.tracks[1].boxes and early.seeds == ((2, 1),)
     assert late.tracks[1].boxes == parts.tracks[2].boxes and late.seeds == ((6, 1),)
-    assert early.tracks[1].gone == late.tracks[1].boxes.keys()
+    assert early.tracks[1].removed_frames == late.tracks[1].boxes.keys()
     for frame, side in ((7, "after"), (0, "before")):
         with pytest.raises(InputError, match="no boxes"):
             apply(state, {"do": "trim", "track": 1, "frame": frame, "side": side}, DRIVING)

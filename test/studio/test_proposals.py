@@ -1,4 +1,4 @@
-"""Proposals for a simulated drive from seeds only, and the simulated annotator."""
+"""Proposals for a simulated drive, from seeds only."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidar_perception.classes import CAR
+from lidar_perception.classes import CAR, PEDESTRIAN
 from lidar_perception.data.frame import BOXES, POSES, Recording
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.geometry import points_in_box
@@ -20,11 +20,10 @@ from lidar_perception.simulation.recording import simulate_frames
 from lidar_perception.types import InputError
 from lidar_studio import survey_cache
 from lidar_studio.actions import apply
-from lidar_studio.annotator import Annotator, Truth, is_right
 from lidar_studio.drive import Drive
 from lidar_studio.journal import JOURNAL_NAME
+from lidar_studio.proposals import compute_size_similarity
 from lidar_studio.session import open_session
-from lidar_studio.size_similarity import compute_size_similarity
 from lidar_studio.snap import snap_to_cluster, snap_to_ground
 from lidar_studio.state import KEY, PROPOSED, Box, State, track_to_json
 
@@ -47,8 +46,13 @@ def session(drive, tmp_path):
 
 def person(session):
     """Return the nearest labelled person: boxes by frame, the first frame, and a measured point."""
-    people = Truth(session).people.values()
-    boxes = min(people, key=lambda b: np.hypot(*next(iter(b.values()))[:2]))
+    people = {}
+    for f, frame in enumerate(session.drive.frames):
+        truth = frame.truth()
+        for box, extra in zip(truth.boxes[truth.class_ids == PEDESTRIAN],
+                              np.array(truth.extras)[truth.class_ids == PEDESTRIAN]):
+            people.setdefault(extra["track_id"], {})[f] = box
+    boxes = min(people.values(), key=lambda b: np.hypot(*next(iter(b.values()))[:2]))
     frame = min(boxes)
     scan = session.drive.load_scan(frame)
     inside = scan.xyz[points_in_box(scan.xyz, boxes[frame]) & (scan.cluster_ids > 0)]
@@ -63,7 +67,7 @@ def click(session):
 
 
 def test_clicked_person_is_tracked_through_the_drive(session):
-    session.propose(in_process=True)
+    session.propose()
     assert not session.state.tracks  # nothing is like nobody
     boxes, track = click(session)
     assert len(boxes) >= FRAMES - 1 and boxes.keys() <= track.boxes.keys()
@@ -81,11 +85,11 @@ def boxes_of(session):
 
 def test_seed_in_a_long_drive_is_tracked_nearby_first(
         session, drive, tmp_path, monkeypatch):
-    session.propose(in_process=True)
+    session.propose()
     click(session)
     full = boxes_of(session)
     with open_session(drive, tmp_path / "long", detector=None) as long:
-        long.propose(in_process=True)
+        long.propose()
         before = long.state
         monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
         _, frame, xyz = person(long)
@@ -101,7 +105,7 @@ def test_seed_in_a_long_drive_is_tracked_nearby_first(
 
 
 def test_seed_is_applied_once_and_its_tracks_are_encoded_once(session, monkeypatch):
-    session.propose(in_process=True)
+    session.propose()
     applied, encoded = [], []
     monkeypatch.setattr("lidar_studio.session.apply",
                         lambda *args: applied.append(args) or apply(*args))
@@ -114,7 +118,7 @@ def test_seed_is_applied_once_and_its_tracks_are_encoded_once(session, monkeypat
 
 
 def test_clicked_car_is_a_seed_and_similar_cars_are_proposed(session):
-    session.propose(in_process=True)
+    session.propose()
     frame = session.drive.frames[0]
     truth, scan = frame.truth(), session.drive.load_scan(0)
     cars = truth.of_class(CAR)
@@ -129,8 +133,8 @@ def test_clicked_car_is_a_seed_and_similar_cars_are_proposed(session):
     assert other and all(t.class_name == "Car" and t.state == PROPOSED for t in other)
     scores = [t.score for t in sorted(other, key=lambda t: t.id)]
     assert scores == sorted(scores, reverse=True)
-    silhouettes = session.proposer.compare_with_seed(session.state, own, 0)
-    assert silhouettes["similarity"] > 0.9 and "1" in silhouettes["seed"]["bits"]
+    with pytest.raises(InputError, match="no seed of a pedestrian"):
+        session.proposer.compare_with_seed(session.state, own, 0)
 
 
 @given(st.floats(0.5, 12), st.floats(0.3, 3), st.floats(0.5, 4), st.floats(0.2, 1.2))
@@ -151,12 +155,13 @@ def run_survey(drive, folder, until=FRAMES):
     progress, messages = [], []
     with open_session(drive, folder, detector=None) as session:
         session.listeners.append(lambda event: messages.append(event.get("error", "")))
+        run = session.proposer.run_survey
 
-        def report(count):
+        def report(count, on_progress):
             progress.append(count)
-            if count == until < FRAMES:
-                session.cancel()
-        session.propose(in_process=True, on_progress=report)
+            return on_progress(count) and not count == until < FRAMES
+        session.proposer.run_survey = lambda f: run(lambda count: report(count, f))
+        session.propose()
         if until == FRAMES:
             click(session)
     return progress, "".join(messages), boxes_of(session)
@@ -214,14 +219,14 @@ def test_seed_corrected_before_tracking_is_tracked(
         drive, tmp_path, monkeypatch, restarted):
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
     with open_session(drive, tmp_path, detector=None) as session:
-        session.propose(in_process=True)
+        session.propose()
         monkeypatch.setattr(session, "_start", lambda *_: None)  # it had no time
         _, track = click(session)
         moved = [track.boxes[1].values[0] + 0.1, *track.boxes[1].values[1:]]
         session.do({"do": "box", "track": track.id, "frame": 1, "box": moved})
         assert len(session.state.tracks[track.id].boxes) < FRAMES - 1
         if not restarted:
-            session.propose(in_process=True, again=False)
+            session.propose(again=False)
             found = session.state.tracks[track.id]
     if restarted:
         with open_session(drive, tmp_path, detector=None) as again:
@@ -236,7 +241,7 @@ def test_seed_corrected_before_tracking_is_tracked(
 def test_undoing_a_correction_after_tracking_leaves_it_tracked(
         session, monkeypatch):
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
-    session.propose(in_process=True)
+    session.propose()
     begun, start = [], session._start
     monkeypatch.setattr(session, "_start", lambda *asked: begun.append(asked))  # slowly
     _, track = click(session)
@@ -258,7 +263,7 @@ def test_undoing_a_correction_after_tracking_leaves_it_tracked(
 def test_click_rejected_while_tracking_is_tracked_once_restored(
         session, monkeypatch, verb):
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
-    session.propose(in_process=True)
+    session.propose()
     begun, start = [], session._start
     monkeypatch.setattr(session, "_start", lambda *asked: begun.append(asked))  # slowly
     _, track = click(session)
@@ -277,7 +282,7 @@ def test_click_rejected_while_tracking_is_tracked_once_restored(
 def test_first_proposals_are_not_undoable(session):
     session.do({"do": "check", "frame": 1})
     session.do({"do": "undo"})
-    session.propose(in_process=True)
+    session.propose()
     assert not session.state.undo_stack
     session.do({"do": "redo"})
     assert session.state.checked == {1}
@@ -288,7 +293,7 @@ def test_first_proposals_are_not_undoable(session):
 
 def test_survey_survives_a_restart_and_is_redone_if_damaged(drive, tmp_path):
     with open_session(drive, tmp_path, detector=None) as session:
-        session.propose(in_process=True)
+        session.propose()
     folder, key = tmp_path / survey_cache.FOLDER, survey_cache.make_key(drive, None)
     surveys, _ = survey_cache.read(folder, key)
     for old, new in zip(session.proposer.surveys, surveys, strict=True):
@@ -308,7 +313,7 @@ def test_survey_survives_a_restart_and_is_redone_if_damaged(drive, tmp_path):
         messages = []
         again.listeners.append(lambda event: messages.append(event.get("error", "")))
         assert again.has_proposals and again.proposer.surveys is None
-        again.propose(in_process=True, again=False)
+        again.propose(again=False)
         assert any("damaged" in line for line in messages) and again.proposer.surveys is not None
     with open_session(drive, tmp_path, detector=None) as third:
         assert third.proposer.surveys is not None
@@ -319,7 +324,7 @@ def test_survey_survives_a_restart_and_is_redone_if_damaged(drive, tmp_path):
 def test_person_clicked_before_the_survey_is_tracked_after_it(session):
     _, track = click(session)
     assert len(track.boxes) == 1
-    session.propose(in_process=True)
+    session.propose()
     extend_track = session.state.tracks[track.id]
     assert len(extend_track.boxes) >= FRAMES - 1 and extend_track.state == "accepted"
     key, = [f for f, b in extend_track.boxes.items() if b.kind == KEY]
@@ -327,37 +332,24 @@ def test_person_clicked_before_the_survey_is_tracked_after_it(session):
 
 
 def test_proposing_again_keeps_decisions(session):
-    session.propose(in_process=True)
+    session.propose()
     click(session)
     waiting = [t for t in session.state.tracks.values() if t.state == PROPOSED]
     for track in waiting[::2]:
         session.do({"do": "reject", "track": track.id})
     before = session.state.tracks
-    session.propose(in_process=True)
+    session.propose()
     assert session.state.tracks == before
 
 
 def test_journal_of_proposals_is_replayed_without_a_survey(session, drive, tmp_path):
-    session.propose(in_process=True)
+    session.propose()
     click(session)
     state = session.state
     session.journal.close()
     journal = type(session.journal)(tmp_path, session.journal._header)
     again = type(session)(drive, journal, detector=None)
     assert again.state == state and again.has_proposals
-
-
-def test_annotator_gets_every_person_right_with_less_work(session):
-    session.propose(in_process=True)
-    done = Annotator(session).run()
-    truth = Truth(session)
-    assert done["people"] == len(truth.people) > 0
-    accepted = [t for t in session.state.tracks.values() if t.state == "accepted"]
-    for boxes in truth.people.values():
-        for f, true in boxes.items():
-            assert any(f in t.boxes and is_right(np.array(t.boxes[f].values), true)
-                       for t in accepted)
-    assert done["actions"] == sum(done["kinds"].values()) < done["by_hand"]
 
 
 def test_task_cancelled_while_waiting_ends_immediately(session):
@@ -375,7 +367,7 @@ def test_task_cancelled_while_waiting_ends_immediately(session):
 def test_cancelled_proposals_write_nothing(session):
     session.busy = {"what": "proposing", "done": 0, "of": FRAMES}
     session.listeners.append(lambda event: session.cancel())
-    session.propose(in_process=True)
+    session.propose()
     assert session.state == State() and session.proposer.surveys is None
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from lidar_perception.classes import PEDESTRIAN
 from lidar_perception.cli.main import main
 from lidar_perception.geometry import points_in_box
-from lidar_studio import page_content, results, server, session  # noqa: F401
+from lidar_studio import results, server, session  # noqa: F401
 from lidar_studio.cli import label, view  # noqa: F401  loaded once, for all servers
 
 PATIENCE = 60.0  # seconds
