@@ -1,7 +1,7 @@
-"""Table of the object classes and their numbers: a new class is one row.
+"""Table of the object classes and their constants: a new class is one row.
 
-Names are those of KITTI's labels. Classes with `numbers` are detected and scored; the others are
-labelled only. simulation/shapes/ holds the shapes of simulated objects.
+Names are those of KITTI's labels. Classes with `numbers` are detected and scored; the others occur
+in labels only. The shapes of simulated objects are in simulation/shapes/.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ Size = tuple[float, float, float]  # length, width, height, metres
 
 @dataclass(frozen=True)
 class DetectionNumbers:
-    """Numbers of a class that is detected.
+    """Constants of a detected class.
 
-    anchor: anchor box of PointPillars. It learns the class from a BEV IoU of `matched` on, and
-        background below `unmatched` (Lang et al., CVPR 2019, Section 4.1 and its code).
+    anchor: anchor box of PointPillars; positive at a BEV IoU of at least `matched`, background
+        below `unmatched` (Lang et al., CVPR 2019, Section 4.1 and its code).
     mean_size: mean of KITTI's labels, to which PointNet's sizes are relative.
     min_diagonal: smallest diagonal of a cluster's box in x-y, in metres (paper B, Table 2, whose
         ranges 0.40-1.71, 1.72-2.99 and 3.00-6.40 are rounded; here each extends to the next).
-    strict, relaxed: IoU from which a detection is a hit, by KITTI and for small objects.
+    strict, relaxed: minimum IoU of a hit, as in KITTI and for small objects.
     """
 
     anchor: Size
@@ -36,11 +36,10 @@ class DetectionNumbers:
 class ObjectClass:
     """A class of objects.
 
-    looks_like: a class whose detections on this one count neither as hits nor as errors, as in
-        KITTI's benchmark.
-    vehicle: True if people can be inside.
+    looks_like: class whose detections on this object are ignored, as in KITTI's benchmark.
+    vehicle: True if it can contain people.
     moves_as: vehicle, pedestrian or cyclist, for the tracker.
-    called: names of the class in other stacks.
+    aliases: names of the class in other stacks.
     """
 
     name: str
@@ -48,24 +47,24 @@ class ObjectClass:
     looks_like: str = ""
     vehicle: bool = False
     moves_as: str = "vehicle"
-    called: tuple[str, ...] = ()
+    aliases: tuple[str, ...] = ()
 
 
 TABLE = (
     ObjectClass("Car", DetectionNumbers((3.9, 1.6, 1.56), 0.6, 0.45, (3.88, 1.63, 1.53), 3.00, 0.7,
                                         0.5),
-                vehicle=True, called=("vehicle", "automobile")),
+                vehicle=True, aliases=("vehicle", "automobile")),
     ObjectClass("Van", looks_like="Car", vehicle=True),
     ObjectClass("Truck", vehicle=True),
     ObjectClass("Pedestrian",
                 DetectionNumbers((0.8, 0.6, 1.73), 0.5, 0.35, (0.84, 0.66, 1.76), 0.40, 0.5,
                                  0.25), moves_as="pedestrian",
-                called=("person", "people", "human")),
+                aliases=("person", "people", "human")),
     ObjectClass("Person_sitting", looks_like="Pedestrian", moves_as="pedestrian"),
     ObjectClass("Cyclist", DetectionNumbers((1.76, 0.6, 1.73), 0.5, 0.35, (1.76, 0.60, 1.74), 1.72,
                                             0.5,
                                             0.25), moves_as="cyclist",
-                called=("bicycle", "bicyclist", "rider")),
+                aliases=("bicycle", "bicyclist", "rider")),
     ObjectClass("Tram", vehicle=True),
     ObjectClass("Misc"),
     ObjectClass("DontCare"),
@@ -76,7 +75,7 @@ CLASSES = tuple(row.name for row in TABLE)
 _NAME_BY_SPELLING = {"".join(filter(str.isalnum, name)).casefold(): name for name in CLASSES}
 # Index into CLASSES by every name of a class, in lower case.
 ID_BY_ALIAS = {name.casefold(): i for i, row in enumerate(TABLE)
-               for name in (row.name, *row.called)}
+               for name in (row.name, *row.aliases)}
 DETECTED = {row.name: row.numbers for row in TABLE if row.numbers is not None}
 BY_SIZE = sorted(DETECTED, key=lambda name: -DETECTED[name].min_diagonal)  # largest first
 CAR, PEDESTRIAN, CYCLIST, DONT_CARE = map(CLASSES.index, ("Car", "Pedestrian", "Cyclist",
@@ -84,8 +83,8 @@ CAR, PEDESTRIAN, CYCLIST, DONT_CARE = map(CLASSES.index, ("Car", "Pedestrian", "
 
 
 def class_name(text: str) -> str:
-    """Return the name in CLASSES that a text spells, or the text itself if there is none.
+    """Return the name in CLASSES that a text spells, else the text itself.
 
-    Case, blanks and punctuation do not matter: "car", "Person (sitting)".
+    Case, blanks and punctuation are ignored: "car", "Person (sitting)".
     """
     return _NAME_BY_SPELLING.get("".join(filter(str.isalnum, text)).casefold(), text)

@@ -1,7 +1,7 @@
-"""Declaration of parameters: dataclass fields with unit, range and text, checked on construction.
+"""Declaration of parameters: dataclass fields with unit, range and description.
 
-The params.py of each room declare the parameters. A group may hold further groups, whose fields
-have dotted names, such as ground.cloth.resolution.
+Values are checked on construction. Groups may be nested; the fields of inner groups have dotted
+names, such as ground.cloth.resolution.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def param(default: Any, doc: str, *, unit: str = "", low: float | None = None,
     """Declare a parameter: a dataclass field with metadata for ROS, YAML, command line and docs.
 
     Args:
-        default: a type stands for an empty list of that type.
+        default: default value; a type means an empty list of that type.
         doc: description, one or more sentences.
         low, high: inclusive limits.
         fixed: True if the parameter cannot change while a node runs.
@@ -55,7 +55,7 @@ class Params:
 
 
 def _check_value(f: dataclasses.Field[Any], value: Any) -> Any:
-    """Return the value in the type of the field's default, or raise ValueError."""
+    """Return the value, converted to the type of the field's default. ValueError if invalid."""
     default, limits = f.default, f.metadata
     if isinstance(default, tuple):
         if isinstance(value, str) or not hasattr(value, "__iter__"):
@@ -117,7 +117,7 @@ def _with_default(f: dataclasses.Field[Any], value: Any) -> dataclasses.Field[An
 
 
 def describe_fields(fields: Mapping[str, dataclasses.Field[Any]]) -> list[str]:
-    """Return lines with name, default, unit and text of each field."""
+    """Return lines of text with the name, default, unit and description of each field."""
     lines = []
     for name, f in fields.items():
         default = list(f.default) if isinstance(f.default, tuple) else f.default
@@ -127,10 +127,10 @@ def describe_fields(fields: Mapping[str, dataclasses.Field[Any]]) -> list[str]:
 
 
 def with_values(params: Any, values: Mapping[str, Any]) -> Any:
-    """Return params with values replaced by dotted name, as {'clustering.dbscan.min_samples': 5}.
+    """Return params with other values, given by dotted name: {'clustering.dbscan.min_samples': 5}.
 
     Raises:
-        ValueError: naming an unknown parameter or a wrong value.
+        ValueError: a parameter is unknown, or a value is invalid.
     """
     known = collect_fields(params)
     if unknown := [name for name in values if name not in known]:
@@ -139,7 +139,6 @@ def with_values(params: Any, values: Mapping[str, Any]) -> Any:
 
 
 def _replace_values(params: Any, values: Mapping[str, Any], prefix: str) -> Any:
-    """Return params with the values replaced whose dotted name begins with prefix."""
     changed = {}
     for f in fields(params):
         inner, name = getattr(params, f.name), prefix + f.name

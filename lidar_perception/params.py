@@ -1,9 +1,8 @@
-"""The parameters of the nodes, composed of the groups that lie beside each algorithm.
+"""Parameters of the nodes, composed of the parameter groups of the algorithms.
 
-A number lives once, in the params.py of its room: one frozen dataclass an algorithm. From its
-fields come the ROS parameter declarations with their descriptors, the check of YAML files, the
-command-line flags and the tables in docs/. A value outside its range raises ValueError when the
-dataclass is made, with the name, the value and the range in the message.
+Each number is defined once, in the params.py of its package, as a field of a frozen dataclass. The
+ROS parameters with their descriptors, the check of YAML files, the command-line flags and the
+tables in docs/ are generated from these fields. A value outside its range raises ValueError.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from lidar_perception.wire.params import InputParams, ViewParams
 
 @dataclass(frozen=True)
 class ReceptionParams(Params):
-    """How a node takes its clouds, and from when on it says that something is wrong with them."""
+    """Reception of clouds, and the limits of its diagnostics."""
 
     reliability: str = param("auto", "auto: reliable if every publisher of the topic offers it, "
                              "otherwise best_effort. "
@@ -74,7 +73,7 @@ class MarkerParams(Params):
 
 @dataclass(frozen=True)
 class TrackMarkerParams(MarkerParams):
-    """Boxes, and the ways of tracks."""
+    """Boxes and trails of tracks."""
 
     trail: float = param(2.0, "Duration of the drawn path of a track; 0: no path.", unit="s",
                          low=0.0, high=60.0)
@@ -82,7 +81,7 @@ class TrackMarkerParams(MarkerParams):
 
 @dataclass(frozen=True)
 class OptionalTracking(TrackingParams):
-    """Tracks in one process with a detector."""
+    """Tracking in the process of a detector."""
 
     enabled: bool = param(False, "Also publish tracks of the detections on ~/output/tracks.",
                           fixed=True)
@@ -90,7 +89,7 @@ class OptionalTracking(TrackingParams):
 
 @dataclass(frozen=True)
 class CloudNodeParams(Params):
-    """What a node that takes clouds has besides the numbers of its algorithm."""
+    """Parameters of every node that receives clouds."""
 
     input: ReceptionParams = ReceptionParams()
     base_frame: str = param("", "A frame on the ground, such as base_footprint. Height, roll and "
@@ -102,7 +101,7 @@ class CloudNodeParams(Params):
 
 @dataclass(frozen=True)
 class BoxNodeParams(CloudNodeParams):
-    """What a node that makes boxes of clouds has besides the numbers of its algorithm."""
+    """Parameters of every node that publishes boxes."""
 
     output: MarkerParams = MarkerParams()
     target_frame: str = param("", "Frame of the published boxes, by TF at the stamp of their "
@@ -110,8 +109,8 @@ class BoxNodeParams(CloudNodeParams):
 
 
 @dataclass(frozen=True)
-class GroundRobotParams(CloudNodeParams):
-    """What ground_segmentation has besides."""
+class GroundExtraParams(CloudNodeParams):
+    """Additional parameters of ground_segmentation."""
 
     range: str = param(
         "all", "Segment only the points that a detector with this range reads, see `fused.range`; "
@@ -123,7 +122,7 @@ class GroundRobotParams(CloudNodeParams):
 
 @dataclass(frozen=True)
 class DetectionNodeParams(BoxNodeParams):
-    """What a node that detects objects in clouds has besides."""
+    """Parameters of every node that detects objects in clouds."""
 
     output: TrackMarkerParams = TrackMarkerParams()
     tracking: OptionalTracking = OptionalTracking()
@@ -131,21 +130,18 @@ class DetectionNodeParams(BoxNodeParams):
 
 
 @dataclass(frozen=True)
-class PerceptionRobotParams(DetectionNodeParams):
-    """What perception has besides."""
+class PerceptionExtraParams(DetectionNodeParams):
+    """Additional parameters of perception."""
 
     obstacles: ObstacleParams = ObstacleParams()
 
 
 @dataclass(frozen=True)
-class TrackInputParams(CloudNodeParams):
-    """Input parameters of the tracker. Its queue is longer, because no detection may be skipped."""
+class TrackerExtraParams(CloudNodeParams):
+    """Additional parameters of tracker. Its queue is longer, as no detection may be skipped."""
 
     input: ReceptionParams = ReceptionParams(queue=10)
     output: TrackMarkerParams = TrackMarkerParams()
-
-
-# Each node declares the groups of its own stages, under the same names.
 
 
 @dataclass(frozen=True)
@@ -199,11 +195,12 @@ class PlayerParams(Params):
     clock_hz: float = param(0.0, "Rate of /clock messages with the bag's time; 0: none.",
                             unit="Hz", low=0.0, high=1000.0, fixed=True)
     wait_for: tuple[str, ...] = param(str, "Topics that must have a subscriber before the first "
-                                      "message, or several: TOPIC:=COUNT. Topics of other nodes "
-                                      "are allowed. Empty: the bag's clouds.", fixed=True)
+                                      "message, or COUNT subscribers: TOPIC:=COUNT. Topics of "
+                                      "other nodes are allowed. Empty: the bag's clouds.",
+                                      fixed=True)
     follow: tuple[str, ...] = param(str, "Topics of detections (MarkerArray): the next cloud is "
                                     "sent once all of them have answered the previous ones, so "
-                                    "that none is lost; meanwhile the bag's time stands still. "
+                                    "that none is lost; meanwhile the bag's time is paused. "
                                     "Empty: play in real time, like a sensor.", fixed=True)
     ahead: int = param(1, "With `follow`: maximum number of clouds without an answer. The nodes "
                        "need an `input.queue` of at least this size. 0: play in real time; "

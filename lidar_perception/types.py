@@ -1,7 +1,7 @@
-"""The shared types: one LiDAR frame in, detections out.
+"""Shared types: point clouds, detections and ground truth; errors and their messages.
 
-Frames follow REP-103 (x forward, y left, z up; metres, radians); boxes are
-[x y z l w h yaw] with the centre in x y z.
+Coordinates follow REP-103 (x forward, y left, z up; metres, radians); boxes are [x y z l w h yaw]
+with the centre in x y z.
 """
 
 from __future__ import annotations
@@ -20,50 +20,52 @@ from lidar_perception.intensity import to_unit
 __all__ = ["CLASSES", "PEDESTRIAN", "Detections", "GroundTruth", "InputError", "InputWarning",
            "PointCloud", "usable_returns"]
 
-MAX_RANGE = 1e5  # metres; what is farther is a broken return, not a point
-LIKELY = 0.6  # 0..1, see difflib: two names that are this similar may be the same one, misspelt
-BEGINNING = 3  # characters
-LARGEST = 1e9  # of the numbers of a label; what is larger is damaged
-SENSOR_HEIGHT = 1.73  # metres: KITTI's sensor above the road. Defaults, anchors and simulation
+MAX_RANGE = 1e5  # metres; points beyond are broken returns
+MIN_NAME_SIMILARITY = 0.6  # of a misspelt name, 0..1 as in difflib
+MIN_PREFIX = 3  # characters that a misspelt name shares with the right one
+MAX_NUMBER = 1e9  # larger numbers in labels are damaged
+SENSOR_HEIGHT = 1.73  # metres, of KITTI's sensor above the road; default of anchors and simulation
 
 
 class InputError(ValueError):
-    """Input that cannot be used. The message is one line: what is wrong, and the remedy."""
+    """Invalid input. The message is one line with the problem and the remedy."""
 
 
 class RunError(InputError):
-    """An error that ends a run over many frames; another InputError skips its frame."""
+    """An error that ends a run over many frames; any other InputError skips only its frame."""
 
 
 class InputWarning(UserWarning):
-    """Input that is used, though something in it is wrong. The message is one line."""
+    """A problem in input that can still be used. The message is one line."""
 
 
 def closest_name(name: object, known: Iterable[str]) -> str | None:
-    """Return the name of `known` that `name` is most likely meant to be, or None: one that begins
-    with `name`, else one that is spelt alike, else one that begins alike."""
-    wanted, plain = _plain(str(name)), {_plain(each): each for each in known}
-    alike = [each for each in plain if each[:BEGINNING] == wanted[:BEGINNING]]
-    found = ([each for each in alike if each.startswith(wanted)]
-             or get_close_matches(wanted, plain, 1, LIKELY) or alike)
-    return plain[found[0]] if found else None
+    """Return the known name that a misspelt or shortened name probably means, or None.
+
+    A name that begins with `name` comes first, then one with a similar spelling, then one with the
+    same first characters.
+    """
+    wanted, by_spelling = _normalise(str(name)), {_normalise(n): n for n in known}
+    same_prefix = [n for n in by_spelling if n[:MIN_PREFIX] == wanted[:MIN_PREFIX]]
+    found = ([n for n in same_prefix if n.startswith(wanted)]
+             or get_close_matches(wanted, by_spelling, 1, MIN_NAME_SIMILARITY) or same_prefix)
+    return by_spelling[found[0]] if found else None
 
 
-def _plain(name: str) -> str:
+def _normalise(name: str) -> str:
     return name.lower().replace("_", "-")
 
 
 def unknown_name(what: str, name: object, known: Iterable[str]) -> InputError:
-    """Return the error for a name that is not in `known`: the closest match and all valid names.
+    """Return an error that lists the closest match and all valid names.
 
-    Args:
-        what: the kind of thing, such as "sensor".
+    what: the kind of thing that is named, such as "sensor".
     """
     return InputError(f"there is no {what} {str(name)[:80]!r}{valid_names(name, known)}")
 
 
 def valid_names(name: object, known: Iterable[str]) -> str:
-    """Return the end of a message about an unknown name: the closest match and all valid names."""
+    """Return the end of a message about an unknown name, with the closest match and all names."""
     known = list(known)
     guess = did_you_mean(name, known)
     return f"{guess} Valid names: {', '.join(known)}" if guess else (
@@ -71,17 +73,17 @@ def valid_names(name: object, known: Iterable[str]) -> str:
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Return "; did you mean 'X'?", or "" where no known name is close."""
+    """Return "; did you mean 'X'?", or "" if no known name is similar."""
     guess = closest_name(name, known)
     return f"; did you mean {guess!r}?" if guess else ""
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """One cloud, with only the returns that can be used.
+    """The usable points (see usable_returns) of one cloud.
 
     xyz (N, 3) float32 metres in frame_id, C-contiguous; intensity (N,) float32 0..1 or None;
-    stamp_ns int. All columns went through one mask, see usable_returns.
+    stamp_ns int.
     """
 
     xyz: np.ndarray
@@ -101,34 +103,32 @@ class PointCloud:
     @staticmethod
     def of(points: ArrayLike, intensity: ArrayLike | None = None, stamp_ns: int = 0,
            frame_id: str = "", intensity_max: float | None = None) -> PointCloud:
-        """Return the frame of the usable returns (see usable_returns) among the points of a sensor.
+        """Make a cloud of the usable points (see usable_returns) of a sensor.
 
         Args:
             points: (N, 3) [x y z] or (N, 4) [x y z intensity] of any real type; metres, x forward,
                 y left, z up. An empty sequence is a cloud without points.
-            intensity: (N,) where points are (N, 3) and there is one. NaN, infinite and negative
-                ones are read as 0.
-            intensity_max: the value of a full reflection, by which intensities are divided. None:
-                255 for (N,) of type uint8, otherwise they are 0..1 already; a detector reports
-                those that are not.
+            intensity: (N,) for points (N, 3). NaN, infinite and negative values become 0.
+            intensity_max: value of a full reflection, by which intensities are divided. None: 255
+                for uint8, else 1. Detectors report intensities with an implausible scale.
 
         Raises:
             InputError: wrong shape or type. The message names the shape and the allowed ones.
         """
-        frame = as_point_cloud(points, intensity, stamp_ns, frame_id, intensity_max)
-        usable = usable_returns(frame.xyz)
-        return frame if usable.all() else frame.take(np.flatnonzero(usable))
+        cloud = as_point_cloud(points, intensity, stamp_ns, frame_id, intensity_max)
+        usable = usable_returns(cloud.xyz)
+        return cloud if usable.all() else cloud.take(np.flatnonzero(usable))
 
     def __len__(self) -> int:
         return len(self.xyz)
 
     def take(self, indices: np.ndarray) -> PointCloud:
-        """The frame of the points at indices (M,)."""
+        """Return the cloud of the points at indices (M,)."""
         intensity = None if self.intensity is None else self.intensity.take(indices)
         return PointCloud(self.xyz.take(indices, axis=0), intensity, self.stamp_ns, self.frame_id)
 
     def points(self) -> np.ndarray:
-        """(N, 4) float32 [x y z intensity]; 0 without intensity."""
+        """Return (N, 4) float32 [x y z intensity], with 0 for a missing intensity."""
         intensity = np.zeros(len(self), np.float32) if self.intensity is None else self.intensity
         return np.column_stack([self.xyz, intensity])
 
@@ -136,8 +136,10 @@ class PointCloud:
 def as_point_cloud(cloud: PointCloud | ArrayLike, intensity: ArrayLike | None = None,
                    stamp_ns: int = 0, frame_id: str = "",
                    intensity_max: float | None = None) -> PointCloud:
-    """Return the frame of a cloud with all its points, also those that are not usable; a PointCloud
-    is returned as it is. Arguments and errors as of PointCloud.of."""
+    """Make a cloud of all points, including unusable ones; a PointCloud is returned unchanged.
+
+    For arguments and errors see PointCloud.of.
+    """
     if isinstance(cloud, PointCloud):
         return cloud
     points = _numbers(cloud, "a cloud", "a PointCloud (frame.load() of a recorded frame, "
@@ -169,7 +171,6 @@ def as_point_cloud(cloud: PointCloud | ArrayLike, intensity: ArrayLike | None = 
 
 
 def _numbers(given: Any, what: str, allowed: str) -> np.ndarray:
-    """An array of real numbers. InputError where it is none."""
     try:
         values = np.asarray(given)
     except (TypeError, ValueError, RuntimeError) as error:  # ragged lists, tensors on a GPU
@@ -182,7 +183,7 @@ def _numbers(given: Any, what: str, allowed: str) -> np.ndarray:
 
 
 def check_columns(count: int, **columns: ArrayLike | None) -> None:
-    """Raise InputError naming a column that has not one value for each of count points."""
+    """Raise InputError if a column does not have one value for each of `count` points."""
     for name, column in columns.items():
         if column is not None and np.shape(column) != (count,):
             size = np.size(column)
@@ -191,7 +192,8 @@ def check_columns(count: int, **columns: ArrayLike | None) -> None:
 
 
 def usable_returns(xyz: np.ndarray) -> np.ndarray:
-    """(N,) bool: finite, within 100 km, and not the origin, where drivers put missing returns."""
+    """Return (N,) bool: True for points that are finite, within MAX_RANGE, and not at the origin,
+    where drivers put missing returns."""
     with np.errstate(invalid="ignore", over="ignore"):
         square = np.einsum("ij,ij->i", xyz, xyz)  # NaN and inf survive
         return (square > 0.0) & (square <= MAX_RANGE * MAX_RANGE)
@@ -199,10 +201,12 @@ def usable_returns(xyz: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Detections:
-    """K boxes: boxes (K, 7) float32 [x y z l w h yaw], class_ids (K,) int32 into CLASSES,
-    scores (K,) float32. No detections is K = 0, never None. sources: by the name of what judged
-    them its own probability (K,) float32, NaN where it says nothing; empty where one thing alone
-    did."""
+    """K detected boxes; K = 0 without detections.
+
+    boxes (K, 7) float32 [x y z l w h yaw], class_ids (K,) int32 into CLASSES, scores (K,) float32.
+    sources: probabilities (K,) float32 by each part of a combined detector, by its name; NaN where
+        it has none. Empty for other detectors.
+    """
 
     boxes: np.ndarray
     class_ids: np.ndarray
@@ -212,9 +216,16 @@ class Detections:
     @staticmethod
     def of(boxes: ArrayLike, class_ids: ArrayLike = PEDESTRIAN,
            scores: ArrayLike = 1.0) -> Detections:
-        """Return detections of boxes (K, 7) [x y z l w h yaw], of any real type; one box may be
-        (7,). class_ids are indices into CLASSES or names of classes, such as "Pedestrian"; they
-        and scores are (K,), or one for all. InputError for other shapes and unknown names."""
+        """Make detections.
+
+        Args:
+            boxes: (K, 7) [x y z l w h yaw] of any real type, or (7,) for one box.
+            class_ids: (K,) indices into CLASSES or names such as "Pedestrian", or one for all.
+            scores: (K,), or one for all.
+
+        Raises:
+            InputError: wrong shape, or an unknown name.
+        """
         given = _numbers(boxes, "boxes", "numbers (K, 7) [x y z l w h yaw]")
         if given.ndim > 2 or (given.size and given.shape[-1:] != (7,)):
             raise InputError(f"boxes have shape {given.shape}; allowed is (K, 7) "
@@ -238,23 +249,22 @@ class Detections:
 
     @property
     def labels(self) -> list[str]:
-        """Names of the classes."""
+        """Class names of the boxes."""
         return [CLASSES[i] for i in self.class_ids]
 
     def __getitem__(self, index: np.ndarray | slice) -> Detections:
-        """The detections under a mask, slice or index array."""
+        """Return the detections selected by a mask, slice or index array."""
         return Detections(self.boxes[index], self.class_ids[index], self.scores[index],
-                          {name: said[index] for name, said in self.sources.items()})
+                          {name: scores[index] for name, scores in self.sources.items()})
 
     def followed_by(self, others: Detections) -> Detections:
-        """These and then the others, without sources."""
+        """Return these detections and then the others, without sources."""
         return Detections(np.concatenate([self.boxes, others.boxes]),
                           np.concatenate([self.class_ids, others.class_ids]),
                           np.concatenate([self.scores, others.scores]))
 
 
 def _to_class_ids(given: ArrayLike) -> np.ndarray:
-    """Return indices into CLASSES of indices or names, in an array of the same shape."""
     values = np.asarray(given)
     if values.dtype.kind != "U":
         return np.asarray(given, np.int32)
@@ -265,18 +275,18 @@ def _to_class_ids(given: ArrayLike) -> np.ndarray:
 
 
 def class_ids(names: Iterable[str]) -> list[int]:
-    """Return indices into CLASSES of names in any spelling, see class_name; of another name that of
-    Misc."""
+    """Return the indices into CLASSES of names in any spelling; that of Misc for unknown names."""
     return [CLASSES.index(known if (known := class_name(name)) in CLASSES else "Misc")
             for name in names]
 
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """The labelled objects of one frame, in the LiDAR frame.
+    """The K labelled objects of one frame, in the LiDAR frame.
 
-    boxes (K, 7) float64 [x y z l w h yaw], class_ids (K,) int into CLASSES, extras K dicts with
-    what else is known: track_id, truncated, occluded, alpha, bbox [left top right bottom] pixels.
+    boxes (K, 7) float64 [x y z l w h yaw], class_ids (K,) int into CLASSES.
+    extras: K dicts of optional fields: track_id, truncated, occluded, alpha, bbox [left top right
+        bottom] in pixels.
     notes: (class, extras) of objects without a 3D box, such as KITTI's DontCare regions.
     """
 
@@ -301,5 +311,5 @@ class GroundTruth:
         return [CLASSES[i] for i in self.class_ids]
 
     def of_class(self, class_id: int) -> np.ndarray:
-        """(M, 7) boxes of one class."""
+        """Return the boxes (M, 7) of one class."""
         return self.boxes[self.class_ids == class_id]

@@ -18,9 +18,9 @@ def to_detection_array(boxes: np.ndarray, labels: Sequence[str],
     """Build a Detection3DArray of boxes (K, 7) [x y z l w h yaw], with one hypothesis each.
 
     Args:
-        ids: K ids, as for markers; by default 0..K-1.
-        covariances: (K, 6, 6) of x, y, z and the rotations about them, in metres and radians; by
-            default all zero, which means "unknown", as in sensor_msgs/Imu.
+        ids: K ids, as for markers; default: 0..K-1.
+        covariances: (K, 6, 6) of x, y, z and the rotations about them, in metres and radians;
+            default: zeros, which mean "unknown", as in sensor_msgs/Imu.
     """
     detections = []
     boxes = np.asarray(boxes, float).reshape(-1, 7)
@@ -42,8 +42,8 @@ def to_detection_array(boxes: np.ndarray, labels: Sequence[str],
 def from_detection_array(msg: Any) -> MarkedObjects:
     """Return the objects of a Detection3DArray, each with its most likely class.
 
-    The ids are those of the message if all of them are unique numbers; else they are 0..K-1, and
-    the message's ids, which may be any text, are "id" in extras.
+    If the ids in the message are not unique numbers, ids are 0..K-1, and the original ids, which
+    may be any text, are "id" in extras.
     """
     boxes, labels, scores = [], [], []
     for d in msg.detections:

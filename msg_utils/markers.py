@@ -1,10 +1,10 @@
 """Conversion between labelled boxes and visualization_msgs/MarkerArray, exact in both directions.
 
 Each box is a CUBE marker: pose and scale are the box, ns is the label, text is a JSON object with
-the score and further values. An object without a 3D box (KITTI's DontCare) is the text of a DELETE
-marker, which draws nothing. Each array deletes the markers of the previous array that it does not
-have itself, so that no stale marker stays and none flickers. An array without objects has one
-DELETE marker, whose header names the empty frame.
+the score and other fields. An object without a 3D box (KITTI's DontCare) is the text of a DELETE
+marker, which is not drawn. Each array deletes the markers of the previous array that it does not
+contain, so that none becomes stale or flickers. An array without objects has one DELETE marker, so
+that it has a header.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class MarkedObjects:
 
 
 class MarkerRow(NamedTuple):
-    """Content of a marker that differs between the markers of an array.
+    """The fields of a marker that differ between the markers of an array.
 
     quaternion: (z, w) of the rotation about z. scale: x, y, z. points: (N, 3) metres.
     """
@@ -70,7 +70,7 @@ class MarkerRow(NamedTuple):
 
 
 class MarkerRows(NamedTuple):
-    """A MarkerArray as rows with a common header; read like a message by this module."""
+    """A MarkerArray as rows with a common header; functions of this module read it as a message."""
 
     rows: Sequence[MarkerRow]
     header: Any
@@ -146,10 +146,7 @@ def rows_to_message(rows: Iterable[MarkerRow], header: Any, make: Any, lifetime_
 
 
 def from_marker_array(msg: Any) -> MarkedObjects:
-    """Return the objects of a MarkerArray of this module or of any node that sends CUBEs.
-
-    msg: a message, or MarkerRows.
-    """
+    """Return the objects of a MarkerArray (message or MarkerRows) of any node that sends CUBEs."""
     cubes = [m for m in msg.markers if m.action == ADD and m.type == CUBE]
     extras = [_parse_text(m.text) for m in cubes]
     scores = [_read_score(content) for content in extras]
@@ -162,9 +159,9 @@ def from_marker_array(msg: Any) -> MarkedObjects:
 
 
 def find_header(msg: Any) -> Any | None:
-    """Return the header of the first CUBE of a MarkerArray, because a DELETEALL may have none.
+    """Return the header of the first CUBE of a MarkerArray, else of the first marker, else None.
 
-    Without a CUBE it is that of the first marker; None without markers.
+    A DELETEALL marker may have no header.
     """
     if isinstance(msg, MarkerRows):
         return msg.header
@@ -174,9 +171,9 @@ def find_header(msg: Any) -> Any | None:
 
 
 def list_marker_keys(array: Any) -> frozenset[tuple[str, int]]:
-    """Return (ns, id) of the markers that an array shows, to be `previous` of the next array.
+    """Return (ns, id) of the markers that a MarkerArray, or its rows, adds.
 
-    array: a MarkerArray, or its rows.
+    This is `previous` of the next array.
     """
     return frozenset((m.ns, int(m.id)) for m in getattr(array, "markers", array)
                      if m.action == ADD)

@@ -14,17 +14,16 @@ import numpy as np
 def load_message_class(type_name: str) -> type[Any]:
     """Load a message class by name, such as 'sensor_msgs/msg/PointCloud2'.
 
-    Raises:
-        ModuleNotFoundError: if ROS has no such package.
+    Raises ModuleNotFoundError if the package is not installed.
     """
     package, kind, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
 
 
 def make_ros_message(type_name: str, /, **fields: Any) -> Any:
-    """Make a message of ROS's class.
+    """Make a message of rclpy's class.
 
-    NumPy arrays are converted to array.array, which the setters take without checking each value.
+    NumPy arrays are converted to array.array, whose values the setters do not check one by one.
     """
     for name, value in fields.items():
         if isinstance(value, np.ndarray):

@@ -1,6 +1,6 @@
 """Conversion between sensor_msgs/PointCloud2 and NumPy structured arrays.
 
-Any field order, padding, datatype, count, byte order and row padding.
+Field order, padding, datatypes, counts, byte order and row padding may be arbitrary.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ MAX_STEP = 2**20  # bytes per point; NumPy's limit is 2**31
 
 
 class CloudError(ValueError):
-    """A cloud cannot be read; the message is one line with the error and the remedy."""
+    """Invalid cloud. The message is one line with the problem and the remedy."""
 
 
 def compute_dtype(msg: Any) -> np.dtype:
-    """Return the structured dtype of a cloud's points, in the cloud's byte order.
+    """Return the structured dtype of a cloud's points, with point_step as itemsize.
 
-    Its itemsize is point_step. Fields without a name are padding.
+    Fields without a name are padding.
 
     Raises:
-        CloudError: for an unknown datatype, a field that reaches past point_step, a duplicate name,
-            or a point_step above MAX_STEP.
+        CloudError: unknown datatype, field that extends beyond point_step, duplicate name, or
+            point_step above MAX_STEP.
     """
     if msg.point_step > MAX_STEP:
         raise CloudError(f"point_step = {msg.point_step} is more than {MAX_STEP} bytes a point; "
@@ -54,11 +54,10 @@ def compute_dtype(msg: Any) -> np.dtype:
 def to_array(msg: Any) -> np.ndarray:
     """Return the points of a cloud, (height * width,) structured, row by row.
 
-    The result is a read-only view of the message's buffer, or a copy if rows are padded. A row_step
-    of 0 or of the size of the whole cloud, as some drivers send it, means rows without padding.
+    The result is a read-only view of the message's buffer, or a copy if rows are padded.
 
     Raises:
-        CloudError: if the buffer is too short for height, width and the steps.
+        CloudError: the buffer is too short for height, width and the steps.
     """
     count = msg.height * msg.width
     if count == 0:
@@ -83,7 +82,7 @@ def to_array(msg: Any) -> np.ndarray:
 def compute_row_step(msg: Any) -> int:
     """Return the number of bytes from one row of a cloud to the next.
 
-    A row_step of 0, or of the size of the whole cloud, means rows without padding.
+    Some drivers send a row_step of 0, or of the whole cloud, for rows without padding.
     """
     row, given = msg.width * msg.point_step, msg.row_step
     whole = msg.height * row
@@ -92,10 +91,10 @@ def compute_row_step(msg: Any) -> int:
 
 
 def read_columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """Return (N, len(names)) float32 of the named fields.
+    """Return the named fields as (N, len(names)) float32.
 
     Raises:
-        CloudError: naming a field that is missing or has more than one number.
+        CloudError: a field is missing, or has several numbers per point.
     """
     for name in names:
         if name not in (points.dtype.names or ()):
@@ -111,10 +110,10 @@ def read_columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
 
 
 def read_xyz(points: np.ndarray) -> np.ndarray:
-    """Return (N, 3) float32 coordinates, including invalid returns.
+    """Return the coordinates (N, 3) float32 of all points, including invalid returns.
 
     Raises:
-        CloudError: if x, y or z is missing or not a floating-point field.
+        CloudError: x, y or z is missing or not a floating-point field.
     """
     out = read_columns(points, ("x", "y", "z"))
     for name in "xyz":
@@ -126,7 +125,7 @@ def read_xyz(points: np.ndarray) -> np.ndarray:
 
 def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1,
                is_dense: bool = True) -> Any:
-    """Build a PointCloud2 of a structured array (N,) of any layout; N is a multiple of height."""
+    """Build a PointCloud2 from a structured array (N,) of any layout; N is a multiple of height."""
     width = len(points) // height
     if width * height != len(points):
         raise ValueError(f"{len(points)} points cannot be split into {height} rows")
@@ -135,8 +134,7 @@ def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1,
     if len(orders) > 1:
         raise ValueError("fields of both byte orders cannot be in one cloud")
     return _make_cloud(header, make, make_point_fields(points.dtype, make), data, height=height,
-                       width=width,
-                       point_step=points.dtype.itemsize, is_bigendian=">" in orders,
+                       width=width, point_step=points.dtype.itemsize, is_bigendian=">" in orders,
                        is_dense=is_dense)
 
 
@@ -153,10 +151,10 @@ def make_point_fields(dtype: np.dtype, make: Any) -> list[Any]:
 
 
 def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
-    """Return the cloud with further fields, each (height * width,) of a PointField datatype.
+    """Return the cloud with additional fields, each (height * width,) of a PointField datatype.
 
-    Existing fields keep their bytes; the offset of a new one is a multiple of its size. A field
-    that exists with the same datatype is overwritten. Shape, density and byte order do not change.
+    A field of the same name and datatype is overwritten. The bytes of other fields, the shape,
+    density and byte order do not change. Offsets of new fields are multiples of their size.
     """
     old = to_array(msg)
     order: Literal[">", "<"] = ">" if msg.is_bigendian else "<"
@@ -188,13 +186,12 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
         for name, (at, kind) in places.items():
             np.ndarray(len(old), kind, data, offset=at, strides=(step,))[:] = new[name]
     return _make_cloud(msg.header, make, fields, data.reshape(-1), height=msg.height,
-                       width=msg.width,
-                       point_step=step, is_bigendian=msg.is_bigendian, is_dense=msg.is_dense)
+                       width=msg.width, point_step=step, is_bigendian=msg.is_bigendian,
+                       is_dense=msg.is_dense)
 
 
 def _make_cloud(header: Any, make: Any, fields: list[Any], data: np.ndarray, *, height: int,
-                width: int,
-                point_step: int, is_bigendian: bool, is_dense: bool) -> Any:
+                width: int, point_step: int, is_bigendian: bool, is_dense: bool) -> Any:
     return make("sensor_msgs/msg/PointCloud2", header=header, height=height, width=width,
                 fields=fields, is_bigendian=is_bigendian, point_step=point_step,
                 row_step=width * point_step if data.size else 0, data=data, is_dense=is_dense)

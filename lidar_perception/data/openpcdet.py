@@ -12,7 +12,7 @@ from lidar_perception.data.cloud_files import load_points, make_cloud_scale_read
 from lidar_perception.data.frame import BOXES, Frame, Recording
 from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS
 from lidar_perception.runs.files import read_text
-from lidar_perception.types import CLASSES, LARGEST, GroundTruth, InputError
+from lidar_perception.types import CLASSES, MAX_NUMBER, GroundTruth, InputError
 from lidar_perception.wire.messages import to_class_ids
 from lidar_perception.wire.topics import LIDAR_FRAME
 
@@ -68,7 +68,7 @@ def read_labels(path: Path) -> GroundTruth | None:
             continue
         try:
             box = np.array(words[:7], float)
-            if len(words) < 8 or not ((np.abs(box) <= LARGEST).all() and (box[3:6] > 0).all()):
+            if len(words) < 8 or not ((np.abs(box) <= MAX_NUMBER).all() and (box[3:6] > 0).all()):
                 raise ValueError
         except ValueError:
             raise InputError(f"{path}:{i} is not '{LINE_FORMAT}' with sizes above 0: "

@@ -10,20 +10,20 @@ NODES = {
     "bag_player": ("replay.bag_player.BagPlayer", "params.PlayerParams"),
     "bag_recorder": ("replay.bag_recorder.BagRecorder", "params.RecorderParams"),
     "ground_segmentation": ("ground_segmentation.GroundSegmentation", "params.GroundNodeParams",
-                            "params.GroundRobotParams"),
+                            "params.GroundExtraParams"),
     "clustering": ("clustering.Clustering", "params.ClusteringNodeParams", _BOXES),
     "candidate_refinement": ("candidate_refinement.CandidateRefinement",
                              "params.RefinementNodeParams", _DETECTIONS),
     "evaluator": ("replay.evaluator.Evaluator", "params.EvaluatorParams"),
     "perception": ("perception.Perception", "candidates.params.PipelineParams",
-                   "params.PerceptionRobotParams"),
+                   "params.PerceptionExtraParams"),
     "pointpillars_detector": ("pointpillars_detector.PointPillarsNode",
                               "detectors.pointpillars.params.DetectorParams", _DETECTIONS),
     "pointnet_detector": ("pointnet_detector.PointNetNode",
                           "detectors.pointnet.params.PointNetDetectorParams", _DETECTIONS),
     "fused_detector": ("fused_detector.FusedNode", "detectors.fused.params.FusedDetectorParams",
                        _DETECTIONS),
-    "tracker": ("tracker.TrackerNode", "params.TrackerNodeParams", "params.TrackInputParams"),
+    "tracker": ("tracker.TrackerNode", "params.TrackerNodeParams", "params.TrackerExtraParams"),
 }
 
 

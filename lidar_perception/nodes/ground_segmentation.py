@@ -17,7 +17,7 @@ from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import Obstacles
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.params import GroundNodeParams, GroundRobotParams
+from lidar_perception.params import GroundExtraParams, GroundNodeParams
 from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.types import PointCloud
 from lidar_perception.wire.codec import bag_message
@@ -33,7 +33,7 @@ class GroundSegmentation(ManagedNode):
     """
 
     def __init__(self, **options: Any):
-        super().__init__("ground_segmentation", GroundNodeParams(), GroundRobotParams(), **options)
+        super().__init__("ground_segmentation", GroundNodeParams(), GroundExtraParams(), **options)
 
     def configure(self) -> None:
         with lock_compilation(self.get_logger().info):

@@ -32,7 +32,7 @@ from lidar_perception.nodes.runtime import (
 from lidar_perception.robot.poses import invert_pose, transform_boxes, transform_points
 from lidar_perception.robot.transform_tree import MissingTransform
 from lidar_perception.types import PEDESTRIAN, InputError
-from lidar_perception.wire.messages import make_calibration, read_camera, to_truth
+from lidar_perception.wire.messages import make_calibration, read_calibration, to_truth
 from lidar_perception.wire.params import ViewParams
 from lidar_perception.wire.topics import CLICK
 from msg_utils.markers import from_marker_array
@@ -82,7 +82,7 @@ class CameraInput:
         transform = self.transforms.get((lidar, camera)) or self.transforms.get((camera, lidar))
         level = self.node.transforms.find_placement(header).level
         if transform is not None:
-            result = read_camera(self.info, transform)
+            result = read_calibration(self.info, transform).camera()
         else:
             try:
                 pose = self.node.transforms.tree.lookup(camera, lidar, to_ns(header.stamp))

@@ -14,7 +14,7 @@ from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes, Obstacles
 from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.params import PerceptionRobotParams
+from lidar_perception.params import PerceptionExtraParams
 from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import scatter_values
@@ -27,7 +27,7 @@ class Perception(ManagedNode):
     them. ~/output/points, boxes and obstacles are computed only while there are subscribers."""
 
     def __init__(self, **options: Any):
-        super().__init__("perception", PipelineParams(), PerceptionRobotParams(), **options)
+        super().__init__("perception", PipelineParams(), PerceptionExtraParams(), **options)
 
     def configure(self) -> None:
         with lock_compilation(self.get_logger().info):

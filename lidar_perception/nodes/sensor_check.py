@@ -9,10 +9,10 @@ import numpy as np
 
 from lidar_perception.data.mount_check import find_height_problem, measure_sensor_height
 from lidar_perception.ground.params import SensorPoseParams
-from lidar_perception.intensity import StreamScale
+from lidar_perception.intensity import StreamScale, find_scale_problem
 from lidar_perception.robot.params import CropParams
 from lidar_perception.types import PointCloud
-from lidar_perception.wire.messages import diagnose_intensity, to_point_cloud
+from lidar_perception.wire.messages import to_point_cloud
 
 MEASURED_CLOUDS = 5  # for the sensor height
 
@@ -57,7 +57,8 @@ class SensorCheck:
 
     def find_problem(self, frame: PointCloud, params: Any) -> str | None:
         """Return what contradicts the parameters of read_frame(), with the remedy, or None."""
-        return self.check_height(frame, params.ground.sensor_pose) or diagnose_intensity(frame)
+        return (self.check_height(frame, params.ground.sensor_pose)
+                or find_scale_problem(frame.intensity))
 
     def check_height(self, frame: PointCloud, pose: SensorPoseParams) -> str | None:
         """Return a problem if the measured sensor height differs from that in pose, or None."""

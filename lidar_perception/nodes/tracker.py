@@ -8,7 +8,7 @@ from lidar_perception.classes import DETECTED
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.runtime import MARKERS, OK, WARN
 from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, has_detections_3d
-from lidar_perception.params import TrackerNodeParams, TrackInputParams
+from lidar_perception.params import TrackerExtraParams, TrackerNodeParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import find_unknown_classes, to_detections
 from msg_utils.detections import from_detection_array
@@ -26,7 +26,7 @@ class TrackerNode(ManagedNode):
     waits_for = "detections", "detections_3d"
 
     def __init__(self, **options: Any):
-        super().__init__("tracker", TrackerNodeParams(), TrackInputParams(), **options)
+        super().__init__("tracker", TrackerNodeParams(), TrackerExtraParams(), **options)
 
     def configure(self) -> None:
         self.tracks = TrackOutputs(self, lambda: self.params, clouds=False)

@@ -1,7 +1,6 @@
-"""CDR of arrays of boxes and markers, written from numbers instead of message objects.
+"""CDR of arrays of boxes and markers, encoded without message objects, ten times as fast.
 
-The bytes are those of rclpy for the same messages, with zeros where it leaves padding undefined.
-A message object for each marker, pose and point would take ten times as long.
+The bytes are equal to rclpy's for the same messages, but padding, which it leaves undefined, is 0.
 """
 
 from __future__ import annotations
@@ -88,7 +87,6 @@ def encode_detection_array(boxes: np.ndarray, labels: Sequence[str],
 
 
 def _header(header: Any) -> bytes:
-    """Return the bytes of a std_msgs/Header; the field after it is to be aligned."""
     out = bytearray(STAMP.pack(header.stamp.sec, header.stamp.nanosec))
     _add_string(out, header.frame_id)
     return bytes(out)

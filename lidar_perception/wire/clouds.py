@@ -1,4 +1,4 @@
-"""Messages that contain a point cloud: PointCloud2, compressed clouds and Livox CustomMsg."""
+"""Messages with a point cloud: PointCloud2, CompressedPointCloud2 and Livox CustomMsg."""
 
 from __future__ import annotations
 
@@ -37,17 +37,9 @@ DRIVER_BY_PACKAGE = {
 
 
 def decode_cloud(data: bytes, kind: str) -> Any:
-    """Decode a serialized cloud message and return it as PointCloud2.
+    """Decode a cloud message of one of CLOUD_TYPES in CDR; return a PointCloud2 of rosbags' class.
 
-    Args:
-        data: the message, in CDR.
-        kind: its type, one of CLOUD_TYPES.
-
-    Returns:
-        A sensor_msgs/PointCloud2 of rosbags' class.
-
-    Raises:
-        InputError: the message is damaged, or its compression is not supported.
+    Raises InputError if the message is damaged or its compression is not supported.
     """
     if kind in LIVOX:
         return decode_livox(data)
@@ -56,9 +48,9 @@ def decode_cloud(data: bytes, kind: str) -> Any:
 
 
 def check_readable(data: bytes, kind: str) -> None:
-    """Raise InputError, with the remedy, if the compression of a cloud message is not supported.
+    """Raise InputError if the compression of a cloud message is not supported.
 
-    Damaged messages pass: they are reported when they are decoded.
+    Damaged messages are reported by decode_cloud.
     """
     if kind == COMPRESSED:
         try:
@@ -69,12 +61,9 @@ def check_readable(data: bytes, kind: str) -> None:
 
 
 def find_cloud_topics(topics: Mapping[str, str]) -> list[str]:
-    """Return the sorted names of the topics that carry clouds.
+    """Return the sorted names of the cloud topics, without compressed copies such as /points/zlib.
 
-    A compressed copy of another cloud topic (/points/zlib next to /points) is left out.
-
-    Args:
-        topics: type of each topic, by its name.
+    topics: types by name.
     """
     clouds = {topic for topic, kind in topics.items() if kind in CLOUD_TYPES}
     return sorted(topic for topic in clouds
@@ -82,13 +71,9 @@ def find_cloud_topics(topics: Mapping[str, str]) -> list[str]:
 
 
 def diagnose_packets(topics: Mapping[str, str]) -> str | None:
-    """Explain that a topic carries the raw packets of a sensor or an unsupported scan type.
+    """Explain, with the remedy, that a topic has sensor packets or an unsupported scan type.
 
-    Args:
-        topics: type of each topic, by its name.
-
-    Returns:
-        One sentence with the remedy, or None if no topic is of this kind.
+    topics: types by name. None if there is no such topic.
     """
     for topic, kind in sorted(topics.items()):
         package, _, name = kind.replace("/msg/", "/").partition("/")

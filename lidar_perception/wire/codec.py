@@ -12,7 +12,7 @@ from rosbags.typesys.store import Typestore
 
 from lidar_perception.types import InputError
 
-# Types that are missing in rosbags: Jazzy's vision_msgs, and clouds of other packages.
+# Types that rosbags lacks: Jazzy's vision_msgs, and clouds of other packages.
 LIVOX_PACKAGES = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
 LIVOX = {
     "CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\n"
@@ -48,7 +48,7 @@ def load_typestore() -> Typestore:
 
 
 def bag_message(type_name: str, /, **fields: Any) -> Any:
-    """Create a message of rosbags' class; fields that are not given are zero, empty or False."""
+    """Make a message of rosbags' class; other fields are zero, empty or False."""
     names = {}
     for name, kind in load_typestore().fielddefs[type_name][1]:
         names[name] = fields.pop(name) if name in fields else _zero(kind)
@@ -69,7 +69,7 @@ def decode(data: bytes, type_name: str) -> Any:
     """
     try:
         return load_typestore().deserialize_cdr(data, type_name)
-    except Exception as error:  # rosbags passes on the errors of struct and numpy
+    except Exception as error:  # rosbags does not catch the errors of struct and numpy
         raise InputError(f"{len(data)} bytes are not a valid {type_name} ({error})") from None
 
 

@@ -1,4 +1,4 @@
-"""Decompression with a bounded result, because a few bytes can expand to gigabytes."""
+"""Decompression with a limited size of the result, as a few bytes can expand to gigabytes."""
 
 from __future__ import annotations
 
@@ -45,11 +45,8 @@ def decompress(data: bytes, compression: str, size: int | None) -> bytes:
 
 
 def decompress_message(data: bytes) -> bytes:
-    """Return a CDR message, decompressed if rosbag2 compressed it (compression mode MESSAGE, zstd).
-
-    CDR begins with a zero byte, which distinguishes the two.
-    """
-    if data[:4] != ZSTD_MAGIC:
+    """Decompress a message if rosbag2 compressed it (compression mode MESSAGE, zstd)."""
+    if data[:4] != ZSTD_MAGIC:  # CDR begins with a zero byte
         return data
     size = zstandard.frame_content_size(data)
     return decompress(data, "zstd", None if size < 0 else size)

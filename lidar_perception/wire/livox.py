@@ -1,8 +1,7 @@
 """Vectorized conversion of Livox CustomMsg to PointCloud2, and from ROS 1 to CDR.
 
-livox_ros_driver, livox_ros_driver2 and livox_interfaces define the same message: a header,
-timebase, point_num, lidar_id, rsvd, and points of offset_time [ns], x y z [m], reflectivity
-[0..255], tag and line.
+All Livox packages define the same message: a header, timebase, point_num, lidar_id, rsvd, and
+points of offset_time [ns], x y z [m], reflectivity [0..255], tag and line.
 """
 
 from __future__ import annotations
@@ -20,16 +19,13 @@ from msg_utils.stamps import SECOND_NS, make_header
 FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1",
           "line": "u1"}
 PACKED = np.dtype([(name, f"<{kind}") for name, kind in FIELDS.items()])  # layout in ROS 1
-OFFSETS = [0, 4, 8, 12, 16, 17, 18]  # bytes, of the fields in a point
+OFFSETS = [0, 4, 8, 12, 16, 17, 18]  # of the fields in a point, in bytes
 POINT_BYTES = 20  # in CDR, where each point starts at a multiple of 4
 FIXED_BYTES = 16  # from timebase to rsvd
 
 
 def decode_livox(data: bytes) -> Any:
-    """Convert a CustomMsg in CDR to a PointCloud2 with all its columns.
-
-    Raises InputError if the message is damaged.
-    """
+    """Convert a CustomMsg in CDR to a PointCloud2 with all columns. InputError if damaged."""
     try:
         order = "<" if data[1] & 1 else ">"
         seconds, nanoseconds, size = struct.unpack_from(f"{order}iII", data, 4)
@@ -49,10 +45,7 @@ def decode_livox(data: bytes) -> Any:
 
 
 def livox_ros1_to_cdr(data: bytes) -> bytes:
-    """Convert a serialized ROS 1 CustomMsg to CDR.
-
-    Raises ValueError or struct.error if the message is damaged.
-    """
+    """Convert a serialized ROS 1 CustomMsg to CDR. ValueError or struct.error if damaged."""
     size, = struct.unpack_from("<I", data, 12)  # after seq and stamp of the header
     start = 16 + size
     count, = struct.unpack_from("<I", data, start + FIXED_BYTES)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
-from lidar_perception.camera import Calibration, Camera
+from lidar_perception.camera import Calibration
 from lidar_perception.classes import ID_BY_ALIAS
 from lidar_perception.groups import renumber_ids
 from lidar_perception.intensity import (
@@ -39,9 +39,10 @@ from msg_utils.markers import (
 from msg_utils.point_cloud2 import CloudError, from_array, read_columns, read_xyz, to_array
 from msg_utils.stamps import to_ns
 
-IN_VIEW, OUT_OF_RANGE = 1, 2  # in the column in_view: segmented, or not as no detector reads it
+# In the column in_view: segmented, and not segmented as no detector reads the point.
+IN_VIEW, OUT_OF_RANGE = 1, 2
 MAX_ID = 2**31  # marker ids are int32
-FullScale = Callable[[np.ndarray, DTypeLike], float]  # see intensity.full_scale
+FullScale = Callable[[np.ndarray, DTypeLike], float]  # see intensity.infer_full_scale
 
 
 def to_point_cloud(msg: Any, intensity_max: float | None = None,
@@ -51,13 +52,13 @@ def to_point_cloud(msg: Any, intensity_max: float | None = None,
     If the cloud has a column `in_view`, points where it is 0 are left out.
 
     Args:
-        intensity_max: value of a full reflection; 0: as inferred by `scale`; None: do not read the
+        intensity_max: value of a full reflection; 0: inferred by `scale`; None: do not read the
             intensity.
-        scale: infers the value of a full reflection, from this cloud alone (full_scale) or from all
-            clouds of a stream (StreamScale).
+        scale: infers the value of a full reflection from this cloud (infer_full_scale) or from a
+            stream of clouds (StreamScale).
 
     Returns:
-        The frame, and the indices (N,) of its points in the cloud.
+        The PointCloud, and the indices (N,) of its points in the message.
 
     Raises:
         InputError: the cloud is malformed.
@@ -78,12 +79,11 @@ def to_point_cloud(msg: Any, intensity_max: float | None = None,
         indices = kept if indices is None else indices.take(kept)
         coordinates = coordinates.take(kept, axis=0)
         intensity = None if intensity is None else intensity.take(kept)
-    frame = PointCloud(coordinates, intensity, to_ns(msg.header.stamp), msg.header.frame_id)
-    return frame, np.arange(len(points)) if indices is None else indices
+    cloud = PointCloud(coordinates, intensity, to_ns(msg.header.stamp), msg.header.frame_id)
+    return cloud, np.arange(len(points)) if indices is None else indices
 
 
 def _read_intensity(points: np.ndarray, full: float, scale: FullScale) -> np.ndarray | None:
-    """Return intensities (N,) float32 0..1 (see intensity.to_unit); None without such a field."""
     if (raw := _read_raw_intensity(points)) is None:
         return None
     values, kind = raw
@@ -110,17 +110,12 @@ def read_raw_intensity(msg: Any) -> tuple[np.ndarray, np.dtype] | None:
         raise InputError(str(error)) from None
 
 
-def diagnose_intensity(frame: PointCloud) -> str | None:
-    """Return a message if the intensity scale of a frame is implausible, else None."""
-    return find_scale_problem(frame.intensity)
-
-
 def diagnose_recorded_intensity(source: Any, clouds: Sequence[PointCloud]) -> str | None:
-    """Return a message if the intensity scale of a recording is implausible, else None.
+    """Describe an implausible intensity scale of a recording, with the remedy, or return None.
 
     Args:
-        source: name of the recording, for the message.
-        clouds: a sample of its clouds, judged together.
+        source: name of the recording.
+        clouds: a sample of its clouds.
     """
     intensities = [cloud.intensity for cloud in clouds if cloud.intensity is not None]
     problem = find_scale_problem(np.concatenate(intensities)) if intensities else None
@@ -130,16 +125,16 @@ def diagnose_recorded_intensity(source: Any, clouds: Sequence[PointCloud]) -> st
 
 def scatter_values(values: np.ndarray | int, indices: np.ndarray, msg: Any,
                    dtype: str) -> np.ndarray:
-    """Return a column for all points of a cloud: values (N,) at indices (N,), 0 elsewhere."""
+    """Return a column for all points of a cloud, with values (N,) at indices (N,), 0 elsewhere."""
     column = np.zeros(msg.height * msg.width, dtype)
     column[indices] = values
     return column
 
 
 def read_column(msg: Any, name: str, indices: np.ndarray) -> np.ndarray | None:
-    """Return the values (N,) of a field at indices (N,), or None if the cloud has no such field.
+    """Return the values (N,) of a field at indices (N,); None if the cloud has no such field.
 
-    Raises InputError if the field has more than one number per point.
+    Raises InputError if the field has several numbers per point.
     """
     points = to_array(msg)
     return _single(points, name).take(indices) if name in (points.dtype.names or ()) else None
@@ -169,9 +164,9 @@ def read_cluster_ids(msg: Any, indices: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Read the column `cluster_id` of a cloud, written by any clustering.
 
     Returns:
-        labels (N,) int32 of the points at indices (N,), 0 for noise and 1..K, and the ids (K,)
-            int64 of these clusters in the cloud (see groups.renumbered). None if the cloud has no
-            such column.
+        Labels (N,) int32 of the points at indices (N,), 0 for noise and 1..K, and the ids (K,)
+            int64 of these clusters in the message (see groups.renumber_ids). None if the message
+            has no such column.
 
     Raises:
         InputError: the column does not hold ids.
@@ -192,8 +187,8 @@ def read_calibration(info: Any, transform: Any) -> Calibration:
 
     Args:
         info: sensor_msgs/CameraInfo.
-        transform: geometry_msgs/TransformStamped between the LiDAR frame and the camera frame, in
-            either direction.
+        transform: geometry_msgs/TransformStamped between the LiDAR and camera frames, in either
+            direction.
 
     Raises:
         InputError: P is empty, or the frame names of the two messages do not match.
@@ -222,11 +217,6 @@ def make_calibration(info: Any, lidar_to_camera: np.ndarray) -> Calibration:
     return Calibration(intrinsics, lidar_to_camera, int(info.width), int(info.height))
 
 
-def read_camera(info: Any, transform: Any) -> Camera:
-    """Return the camera described by CameraInfo and extrinsics, see read_calibration."""
-    return read_calibration(info, transform).camera()
-
-
 def make_camera_info(calibration: Calibration, header: Any, make: Any) -> Any:
     """Make the CameraInfo of a rectified image, without distortion."""
     p = calibration.intrinsics
@@ -248,10 +238,9 @@ def make_extrinsics(calibration: Calibration, header: Any, make: Any) -> Any:
 
 
 def make_truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any = ()) -> Any:
-    """Make the MarkerArray of labels.
+    """Make the MarkerArray of labels; `previous` is as in to_marker_array.
 
-    Objects keep the id of their track as marker id where these are unique, and the name of an
-    unknown class (see to_truth). `previous` is as in to_marker_array.
+    Marker ids are track ids if these are unique. Unknown classes keep their names (see to_truth).
     """
     labels = [str(extra.get("class_name", label))
               for label, extra in zip(truth.labels, truth.extras)]
@@ -264,20 +253,17 @@ def make_truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any
 
 
 def to_class_ids(names: Iterable[str]) -> list[int]:
-    """Return the indices into CLASSES of class names of any software stack; Misc if unknown."""
+    """Return the indices into CLASSES of class names or aliases; Misc if unknown."""
     return [ID_BY_ALIAS.get(name.casefold(), CLASSES.index("Misc")) for name in names]
 
 
 def find_unknown_classes(names: Iterable[str]) -> list[str]:
-    """Return the sorted names that to_class_ids does not know."""
+    """Return the sorted names that are neither class names nor aliases."""
     return sorted({name for name in names if name.casefold() not in ID_BY_ALIAS})
 
 
 def to_truth(objects: MarkedObjects) -> GroundTruth:
-    """Convert markers to labels.
-
-    Objects of an unknown class become Misc and keep their name in extras["class_name"].
-    """
+    """Convert markers to labels; unknown classes become Misc, with extras["class_name"]."""
     extras = [{"class_name": label, **extra} if label not in CLASSES else extra
               for label, extra in zip(objects.labels, objects.extras)]
     return GroundTruth.of(objects.boxes, class_ids(objects.labels), extras, objects.notes)
@@ -293,13 +279,12 @@ def make_detection_rows(detections: Detections, previous: Any = (),
                         clusters: np.ndarray | None = None) -> list[MarkerRow]:
     """Return the markers of K detections.
 
-    The text of each marker is JSON with the id, the probability given by each of its sources, and
-    the `cluster_id`. The cluster id is there because a marker id has 32 bits only.
+    The text of each marker is JSON with the id, the probabilities by source, and `cluster_id`, as
+    marker ids have only 32 bits.
 
     Args:
         previous: as in to_marker_array.
-        clusters: (K,) ids in the column `cluster_id` of the cloud, if each detection is one
-            cluster.
+        clusters: (K,) ids in the column `cluster_id` of the cloud, if each detection is a cluster.
     """
     labels = [CLASSES[i] for i in detections.class_ids]
     texts: list[dict[str, Any]] = [{"id": i} for i in range(len(detections))]
@@ -329,12 +314,3 @@ def make_odometry(pose: np.ndarray, header: Any, moving_frame: str, make: Any) -
     message = make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
     return make("nav_msgs/msg/Odometry", header=header, child_frame_id=moving_frame,
                 pose=make("geometry_msgs/msg/PoseWithCovariance", pose=message))
-
-
-def read_pose(pose: Any) -> np.ndarray:
-    """Return a geometry_msgs/Pose as matrix (4, 4) float64.
-
-    Raises InputError if it is not finite, or its quaternion is not of length 1.
-    """
-    p, q = pose.position, pose.orientation
-    return poses.make_pose(*poses.check_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w), "a pose"))

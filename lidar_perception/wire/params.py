@@ -9,7 +9,7 @@ from lidar_perception.param_fields import Params, param
 
 @dataclass(frozen=True)
 class InputParams(Params):
-    """How the fields of a cloud are read."""
+    """Reading of the fields of a cloud."""
 
     intensity_max: float = param(0.0, "Intensity of a full reflection: 1 for KITTI, 255 for "
                                  "Velodyne and nuScenes. 0: 255 for fields of 8 bits; otherwise "

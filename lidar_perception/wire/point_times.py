@@ -16,7 +16,7 @@ from msg_utils.stamps import SECOND_NS, to_ns
 NAMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
 UNITS_NS = (10**9, 10**6, 10**3, 1)
 LIVOX_COLUMN, LIVOX_UNIT_NS = ("offset_time", True), 1  # integers: Livox documents the unit
-SWEEP_S = 2e-3, 1.0   # shortest and longest duration of a turn; this determines the unit
+SWEEP_S = 2e-3, 1.0   # limits of the duration of a turn, from which the unit is inferred
 SINCE_1970_NS = 1e18  # larger values count from 1970
 MAX_OFFSET_S = 1.0    # between a point and the stamp of its cloud
 
@@ -38,10 +38,9 @@ class PointTimes(NamedTuple):
 def read_point_times(msg: Any, indices: np.ndarray) -> PointTimes:
     """Read the measurement times of the points (N,) of a PointCloud2 at indices (N,).
 
-    The unit (s, ms, us or ns) follows from the time span of the whole cloud, which is taken as one
-    turn of the sensor. Values that count from 1970 are converted to times relative to the stamp.
-    Zeros at points other than `indices` are ignored, as drivers write them for beams without
-    return.
+    The unit (s, ms, us or ns) is inferred from the time span of the cloud, which is one turn of the
+    sensor. Times since 1970 are converted to times relative to the stamp. Zeros at other points
+    are ignored, as drivers write them for beams without return.
 
     Raises:
         InputError: there is no such column, no point has a time, or the times do not fit the stamp.
@@ -81,7 +80,7 @@ def read_point_times(msg: Any, indices: np.ndarray) -> PointTimes:
 
 
 def _unit_ns(span: float, is_integer: bool, low: float) -> int:
-    """Return the time unit in ns, from the span of the times of one turn and the least of them."""
+    """Infer the time unit in ns from the time span of one turn and the lowest time."""
     since_1970 = next((unit for unit in reversed(UNITS_NS) if low * unit > SINCE_1970_NS), None)
     if since_1970 is not None:
         return since_1970
@@ -93,7 +92,7 @@ def _unit_ns(span: float, is_integer: bool, low: float) -> int:
 
 def deskew_points(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseLookup
                   ) -> tuple[np.ndarray, np.ndarray, PointTimes] | None:
-    """Move the points of a frame to where they are seen from the sensor's pose at the stamp.
+    """Correct the motion of the sensor: transform points to its pose at the stamp.
 
     Args:
         msg: PointCloud2 with a time column.
@@ -102,8 +101,8 @@ def deskew_points(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseL
         poses: returns the poses (K, 4, 4) of the sensor in a fixed frame at times (K,) ns.
 
     Returns:
-        indices (M,) into `frame` of the points that have a time, their moved coordinates (M, 3),
-        and their times. None if the frame is empty or all points were measured at the stamp.
+        Indices (M,) into `frame` of the points with a time, their new coordinates (M, 3), and their
+        times. None if the frame is empty or all points were measured at the stamp.
     """
     if not len(indices):
         return None
@@ -120,10 +119,7 @@ def deskew_points(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseL
 
 
 def deskew_frame(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseLookup) -> PointCloud:
-    """Return the frame with its points moved to its stamp, see deskew_points.
-
-    Points without a time stay where they are.
-    """
+    """Return the frame after motion correction, see deskew_points. Points without a time stay."""
     if (deskewed_points := deskew_points(msg, frame, indices, poses)) is None:
         return frame
     timed, moved, _ = deskewed_points
@@ -134,9 +130,9 @@ def deskew_frame(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseLo
 
 def replace_points(msg: Any, make: Any, indices: np.ndarray, moved: np.ndarray,
                    times: PointTimes) -> Any:
-    """Return the cloud with the points at indices (N,) replaced by moved (N, 3).
+    """Return the message with new coordinates `moved` (N, 3) of the points at indices (N,).
 
-    All times are set to the stamp, so that a second motion correction changes nothing.
+    All times are set to the stamp, so that a second motion correction has no effect.
     """
     points = to_array(msg)
     columns = {}

@@ -31,16 +31,16 @@ def make_track_rows(ids: np.ndarray, detections: Detections, velocities: np.ndar
                     previous: Iterable[tuple[str, int]] = ()) -> list[MarkerRow]:
     """Return the markers of K tracks.
 
-    Boxes are as in make_detection_rows; their text also has the velocity (m/s), the probability
-    of motion and the extras. In EXTRA_NAMESPACES, with the same ids: an arrow to the position in
-    one second, a label with number and speed, and the trail.
+    Boxes are as in make_detection_rows, with velocity, probability of motion and extras in their
+    texts. EXTRA_NAMESPACES have, with the same ids, an arrow to the position in one second, a label
+    with number and speed, and the trail.
 
     Args:
         ids: (K,) track ids.
         velocities: (K, 2) m/s.
         moving: (K,) probabilities of motion.
-        trails: K arrays (N, 3) of past positions; drawn from two points on.
-        extras: K dicts that are added to the texts of the boxes.
+        trails: K arrays (N, 3) of past positions; those with one point are not drawn.
+        extras: K dicts to add to the texts.
         previous: as in to_marker_array.
     """
     numbers: list[int] = (np.asarray(ids) % MAX_ID).tolist()

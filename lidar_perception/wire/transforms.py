@@ -1,4 +1,4 @@
-"""TF and odometry messages added to a transform tree."""
+"""Addition of TF and odometry messages to a transform tree."""
 
 from __future__ import annotations
 
@@ -9,16 +9,13 @@ from lidar_perception.types import InputError
 from msg_utils.stamps import to_ns
 
 TF_MESSAGE, ODOMETRY_MESSAGE = "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry"
-# Frame names in the tree of an odometry: the fields of the message instead of their contents, which
-# may be equal or empty.
+# Frame names in the tree of an odometry: the names of the message's fields, as their contents may
+# be equal or empty.
 MOVING, FIXED = "child_frame_id", "header.frame_id"
 
 
 def add_transforms(tree: TransformTree, msg: Any, static: bool) -> None:
-    """Add the transforms of a tf2_msgs/TFMessage to a tree.
-
-    Raises InputError after all valid ones were added if one of them is invalid.
-    """
+    """Add the valid transforms of a tf2_msgs/TFMessage, then raise InputError if one is invalid."""
     problem = None
     for stamped in msg.transforms:
         t, q = stamped.transform.translation, stamped.transform.rotation

@@ -21,11 +21,8 @@ from samples import STAMP, object_folder, scene, walker_label, write
 from lidar_perception.camera import FORWARD_CAMERA
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.frame import Frame, Recording, return_none
-from lidar_perception.data.kitti.results import (
-    choose_calibration,
-    read_results,
-    read_tracking_results,
-)
+from lidar_perception.data.kitti.labels import read_tracking_labels
+from lidar_perception.data.kitti.results import choose_calibration, read_results
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detecting.bag import Bag as BagFormat
@@ -208,7 +205,7 @@ def test_tracks_have_ids_and_velocities_that_never_mix(drives, tmp_path, monkeyp
         assert each.track_ids.tolist() == [row["id"] for row in said["objects"]]
         assert [e["velocity"] for e in each.extra] == [row["velocity"] for row in said["objects"]]
         camera = frame.calibration().lidar_to_camera
-        tracks = read_tracking_results(out / f"kitti/{frame.sequence}.txt", camera)[frame.index]
+        tracks = read_tracking_labels(out / f"kitti/{frame.sequence}.txt", camera)[frame.index]
         np.testing.assert_allclose(tracks.boxes[:, :3], np.array(
             objects(content)[frame.name])[:, 2:5], atol=2e-4)
         assert [e["track_id"] for e in tracks.extras] == each.track_ids.tolist()
@@ -223,7 +220,7 @@ def test_written_tracks_score_as_the_tracker_itself(drives, tmp_path, monkeypatc
     )
     for frame in recording:
         if (truth := frame.truth()) is not None:
-            found = read_tracking_results(tmp_path / f"kitti/{frame.sequence}.txt",
+            found = read_tracking_labels(tmp_path / f"kitti/{frame.sequence}.txt",
                                           frame.calibration().lidar_to_camera)
             read.update(observe(frame.sequence, frame.index, truth, found[frame.index],
                                 frame.calibration()))
@@ -244,7 +241,7 @@ def test_drives_of_a_bag_are_tracked_apart(tmp_path, monkeypatch):
     assert ids[0] & ids[1] and ids[2] & ids[3] and not (ids[0] | ids[1]) & (ids[2] | ids[3])
     assert sorted(path.name for path in (out / "kitti").iterdir()) == ["0000.txt", "0001.txt"]
     for name in "0000", "0001":
-        assert [*read_tracking_results(out / f"kitti/{name}.txt",
+        assert [*read_tracking_labels(out / f"kitti/{name}.txt",
                                        FORWARD_CAMERA.lidar_to_camera)] == [0, 1]
 
 

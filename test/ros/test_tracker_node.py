@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from rclpy.qos import QoSProfile
+from robot_bags import read_pose
 from ros_samples import MARKERS
 from tracking_samples import CAR, CYCLIST, START, TENTH, car, cars, crowd, person, pose
 
@@ -27,7 +28,6 @@ from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.messages import (
     make_detection_markers,
     make_odometry,
-    read_pose,
     to_detections,
     to_truth,
 )

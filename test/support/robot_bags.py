@@ -7,6 +7,7 @@ from lidar_perception.data.bag import BagWriter
 from lidar_perception.data.frame import POSES
 from lidar_perception.data.open import open_recording
 from lidar_perception.robot.placement import make_tilted_pose
+from lidar_perception.robot.poses import make_pose
 from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_odometry
@@ -93,3 +94,9 @@ def check(recording, on_base=ON_BASE):
     assert POSES in recording.has
     for frame, stamp in zip(recording, stamps(), strict=True):
         np.testing.assert_allclose(frame.pose(), base_at(stamp) @ on_base, atol=1e-4)
+
+
+def read_pose(pose):
+    """Return a geometry_msgs/Pose as matrix (4, 4)."""
+    p, q = pose.position, pose.orientation
+    return make_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from samples import CALIBRATION, each_make, header
 
 from lidar_perception.camera import Calibration, Camera
+from lidar_perception.intensity import find_scale_problem
 from lidar_perception.types import Detections, InputError
 from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.messages import (
-    diagnose_intensity,
     make_camera_info,
     make_detection_markers,
     make_extrinsics,
-    read_camera,
+    read_calibration,
     read_column,
     to_point_cloud,
 )
@@ -37,7 +35,7 @@ def test_extrinsics_are_read_in_either_direction(make):
     (q.x, q.y, q.z, q.w), (t.x, t.y, t.z) = (map(float, v) for v in inverse_pose)
     expected = CALIBRATION.intrinsics @ CALIBRATION.lidar_to_camera
     for transform in (forth, back):
-        camera = read_camera(info, transform)
+        camera = read_calibration(info, transform).camera()
         np.testing.assert_allclose(camera.projection, expected, atol=1e-9)
         assert (camera.width, camera.height) == (1242, 375)
 
@@ -60,7 +58,7 @@ def test_unusable_camera_is_an_input_error(make, change, words):
     transform = make_extrinsics(CALIBRATION, header(make), make)
     change(info, transform)
     with pytest.raises(InputError, match=words):
-        read_camera(info, transform)
+        read_calibration(info, transform).camera()
 
 
 def test_point_is_in_view_if_its_pixel_is_in_the_image():
@@ -138,13 +136,13 @@ def test_intensities_are_read_in_every_drivers_scale(kind, full):
     points["intensity"] = np.round(expected * full) if full > 1 else expected
     read = to_point_cloud(from_array(points, header(bag_message), bag_message), 0.0)[0]
     np.testing.assert_allclose(read.intensity, expected, atol=0.5 / 255)
-    assert read.intensity.dtype == np.float32 and diagnose_intensity(read) is None
+    assert read.intensity.dtype == np.float32 and find_scale_problem(read.intensity) is None
     if np.dtype(kind).kind == "f":
         points["intensity"][1:4] = np.nan, np.inf, -np.inf
         odd = to_point_cloud(from_array(points, header(bag_message), bag_message), 0.0)[0].intensity
         assert not odd[1:4].any() and np.array_equal(odd[4:], read.intensity[4:])
     points["intensity"] = points["intensity"] * 0.02  # a scale that no driver uses
     dark = to_point_cloud(from_array(points, header(bag_message), bag_message), float(full))[0]
-    assert "input.intensity_max" in diagnose_intensity(dark)
-    assert "input.intensity_max" in diagnose_intensity(replace(dark, intensity=read.intensity * 2))
-    assert diagnose_intensity(dark.take(np.arange(100))) is None
+    assert "input.intensity_max" in find_scale_problem(dark.intensity)
+    assert "input.intensity_max" in find_scale_problem(read.intensity * 2)
+    assert find_scale_problem(dark.intensity[:100]) is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from robot_bags import read_pose
 from samples import each_make, header
 from tracking_samples import CAR, START, TENTH, crowd, pose
 
@@ -10,7 +11,7 @@ from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import make_odometry, read_pose, to_detections
+from lidar_perception.wire.messages import make_odometry, to_detections
 from lidar_perception.wire.track_markers import (
     EXTRA_NAMESPACES,
     MAX_ID,

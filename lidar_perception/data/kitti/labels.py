@@ -13,7 +13,7 @@ import numpy as np
 from lidar_perception.classes import class_name
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.runs.files import check_regular, read_text
-from lidar_perception.types import CLASSES, LARGEST, GroundTruth, InputError, class_ids
+from lidar_perception.types import CLASSES, MAX_NUMBER, GroundTruth, InputError, class_ids
 
 # Columns of a label file after the class, in order; they are kept in GroundTruth.extras.
 COLUMNS = ("truncated", "occluded", "alpha", "bbox", "dimensions", "location", "rotation_y")
@@ -77,7 +77,7 @@ def parse_label(line: str, path: Path | str = "label", number: int = 0,
     text = " ".join(words[:first])  # some tools write class names with spaces
     try:
         numbers = [float(w) for w in words[first:]]
-        if len(numbers) not in (14, 15) or not all(abs(n) <= LARGEST for n in numbers):
+        if len(numbers) not in (14, 15) or not all(abs(n) <= MAX_NUMBER for n in numbers):
             raise ValueError
     except ValueError:
         raise InputError(f"{path}:{number} is not a KITTI label (a class and 14 or 15 numbers): "

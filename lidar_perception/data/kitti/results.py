@@ -13,13 +13,7 @@ import numpy as np
 
 from lidar_perception.camera import FORWARD_CAMERA, Calibration
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.kitti.labels import (
-    format_label,
-    parse_lines,
-    read_tracking_labels,
-    to_ground_truth,
-    to_labels,
-)
+from lidar_perception.data.kitti.labels import format_label, parse_lines, to_ground_truth, to_labels
 from lidar_perception.data.kitti.write import format_tracking_line, project_boxes
 from lidar_perception.runs import journal
 from lidar_perception.runs.files import write_text
@@ -101,21 +95,3 @@ def _to_result_labels(detections: Detections, calibration: Calibration) -> list[
               for score, box in zip(detections.scores, pixels)]
     return to_labels(GroundTruth.of(detections.boxes, detections.class_ids, extras),
                      calibration.lidar_to_camera)
-
-
-def read_tracking_results(path: Path, lidar_to_camera: np.ndarray) -> dict[int, GroundTruth]:
-    """Read a result file of the tracking benchmark.
-
-    Returns:
-        Tracks by frame number, with track_id and score in extras; frames without tracks are left
-        out.
-
-    Raises:
-        InputError: a line is malformed or has no score.
-    """
-    frames = read_tracking_labels(path, lidar_to_camera, known_only=True)
-    for number, tracks in frames.items():
-        if not all("score" in extra for extra in tracks.extras):
-            raise InputError(f"{path}: frame {number} has a track without a score as the 18th "
-                             "column")
-    return frames

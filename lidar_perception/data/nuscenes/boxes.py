@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lidar_perception.types import LARGEST
+from lidar_perception.types import MAX_NUMBER
 
 # The ten classes of the detection task.
 NAMES = ("car", "truck", "bus", "trailer", "construction_vehicle", "pedestrian", "motorcycle",
@@ -101,7 +101,7 @@ def are_valid_rotations(rotations: np.ndarray) -> np.ndarray:
     """Return a mask (K,) of the quaternions (K, 4) that to_matrices accepts."""
     with np.errstate(over="ignore"):
         length = np.linalg.norm(rotations, axis=1)
-    return (length > 0) & (length <= LARGEST)
+    return (length > 0) & (length <= MAX_NUMBER)
 
 
 def to_matrices(rotations: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from lidar_perception.data.nuscenes.boxes import (
     to_global_boxes,
 )
 from lidar_perception.runs.files import check_regular, shorten_error, write_text
-from lidar_perception.types import CLASSES, LARGEST, Detections, InputError
+from lidar_perception.types import CLASSES, MAX_NUMBER, Detections, InputError
 
 MAX_BOXES = 500    # per frame
 # nuScenes' names of our classes; its bicycles include their riders.
@@ -129,11 +129,11 @@ def _parse_boxes(where: str, rows: list) -> GlobalBoxes:
         raise InputError(f"{where}: a box is malformed ({error}); write the results again"
                          ) from None
     numbers = np.column_stack([boxes.centres, boxes.sizes, boxes.scores])
-    invalid = ~((np.abs(numbers) <= LARGEST).all(axis=1) & (boxes.sizes > 0).all(axis=1)
+    invalid = ~((np.abs(numbers) <= MAX_NUMBER).all(axis=1) & (boxes.sizes > 0).all(axis=1)
                 & are_valid_rotations(boxes.rotations)
-                & ~(np.abs(boxes.velocities) > LARGEST).any(axis=1))
+                & ~(np.abs(boxes.velocities) > MAX_NUMBER).any(axis=1))
     if invalid.any():
         raise InputError(f"{where}, box {np.flatnonzero(invalid)[0]}: translation, size, rotation "
-                         f"and score must be finite and within {LARGEST:g}, sizes above 0, the "
+                         f"and score must be finite and within {MAX_NUMBER:g}, sizes above 0, the "
                          "rotation a quaternion, and the velocity finite or NaN")
     return boxes

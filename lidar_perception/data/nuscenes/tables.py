@@ -15,7 +15,7 @@ import numpy as np
 
 from lidar_perception.data.nuscenes.boxes import are_valid_rotations
 from lidar_perception.runs.files import check_regular, shorten_error
-from lidar_perception.types import LARGEST, InputError
+from lidar_perception.types import MAX_NUMBER, InputError
 
 CHUNK_SIZE = 2**22   # characters read at a time; rows are shorter
 SEPARATORS = " \t\r\n,"
@@ -109,9 +109,9 @@ class Tables:
             column = np.zeros((len(values), 0))
         if len(values) == 0:
             return np.zeros((0, width))
-        if column.shape[1] != width or not (np.abs(column) <= LARGEST).all() or (
+        if column.shape[1] != width or not (np.abs(column) <= MAX_NUMBER).all() or (
                 field == "rotation" and not are_valid_rotations(column).all()):
             wanted = ("a quaternion" if field == "rotation" else
-                      f"{width} finite numbers within {LARGEST:g}")
+                      f"{width} finite numbers within {MAX_NUMBER:g}")
             raise InputError(f"{self.path(table)}: a {field} is not {wanted}; download it again")
         return column
