@@ -226,9 +226,12 @@ class PointNetTraining(SceneTraining):
 
     network: str = param("improved", "improved: the paper's network. pointnet, pointnet2: plain "
                          "PointNet and PointNet++ (single-scale grouping), for comparison. The "
-                         "others are rows of the paper's ablation.", choices=(
+                         "others are rows of the paper's ablation, other choices of centroids "
+                         "and weights, and other radii.", choices=(
                              "improved", "pointnet", "pointnet2", "base", "dynamic-threshold",
-                             "log-point-count", "skip", "msg-mrg", "msg-skip", "mrg-skip"))
+                             "log-point-count", "skip", "msg-mrg", "msg-skip", "mrg-skip",
+                             "farthest", "ball-density", "farthest-ball-density", "radii-halved",
+                             "radii-doubled", "radii-quadrupled"))
     proposer: str = param("", "Weights of PointPillars, or `package` for the shipped ones. Its "
                           "wrong proposals are added as background examples, because `fused` "
                           "classifies its boxes. Empty: none.")

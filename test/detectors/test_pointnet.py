@@ -22,7 +22,12 @@ from lidar_perception.detectors.pointnet.clusters import (
 )
 from lidar_perception.detectors.pointnet.config import ABLATIONS, NETWORKS, make_pointnet_config
 from lidar_perception.detectors.pointnet.losses import cluster_loss
-from lidar_perception.detectors.pointnet.network import fuse_norms, make_pointnet, nearest
+from lidar_perception.detectors.pointnet.network import (
+    fuse_norms,
+    make_pointnet,
+    nearest,
+    squared_distances,
+)
 from lidar_perception.detectors.pointnet.predict import (
     compute_probabilities,
     predict,
@@ -98,6 +103,21 @@ def test_sampled_points_are_unique_and_independent_of_others(rng):
     assert np.array_equal(other.context, inputs.context)
 
 
+@pytest.mark.parametrize("size", [1, 3, 20, 60])
+def test_farthest_points_come_first(rng, size):
+    clusters = blobs(rng, [size, 7])
+    plain = make_network_input(clusters, 24)
+    inputs = make_network_input(clusters, 24, farthest=10)
+    np.testing.assert_array_equal(inputs.valid, plain.valid)
+    xyz, drawn = (x.points[0][x.valid[0]] for x in (inputs, plain))
+    order = [0]
+    while len(order) < min(10, len(drawn)):
+        apart = np.linalg.norm(drawn[:, None, :3] - drawn[order, :3], axis=2).min(axis=1)
+        order.append(int(apart.argmax()))
+    np.testing.assert_array_equal(xyz[:len(order)], drawn[order])
+    assert {*map(tuple, xyz)} == {*map(tuple, drawn)}
+
+
 def test_ground_height_follows_slopes(rng):
     flat = rng.uniform(-40, 40, (20_000, 3))
     flat[:, 2] = 0.05 * flat[:, 0] - 1.7
@@ -148,7 +168,7 @@ def test_nearest_equals_brute_force(rng):
     xyz = torch.from_numpy(rng.normal(size=(3, 20, 3)))
     valid = torch.from_numpy(rng.random((3, 20)) < 0.7)
     valid[:, :5] = True
-    squared, indices = nearest(xyz[:, :5], xyz, valid, 4)
+    squared, indices = nearest(squared_distances(xyz[:, :5], xyz, valid), 4)
     for b in range(3):
         for c in range(5):
             apart = ((xyz[b] - xyz[b, c]) ** 2).sum(-1)
@@ -157,8 +177,9 @@ def test_nearest_equals_brute_force(rng):
             assert torch.equal(apart[indices[b, c]].sort().values, apart.sort().values[:4])
 
 
-def test_groups_are_what_plain_loops_make_of_them(rng):
-    net = network()
+@pytest.mark.parametrize("name", ["improved", "ball-density"])
+def test_groups_are_what_plain_loops_make_of_them(rng, name):
+    net = network(name)
     inputs = make_network_input(blobs(rng, [60, 5]), net.config.points)
     points, valid = torch.from_numpy(inputs.points), torch.from_numpy(inputs.valid)
     with torch.inference_mode():
@@ -176,7 +197,8 @@ def test_groups_are_what_plain_loops_make_of_them(rng):
                     rows = torch.stack([torch.cat([(points[b, i, :3] - middle) / radius,
                                                    points[b, i, 3:]]) for i in near])
                     scales.append(part(rows).amax(dim=0))
-                    density.append(len(near) / (k * radius))
+                    density.append(len(near) / (k * radius) if name == "improved" else
+                                   (apart[real] <= radius).sum() / radius**3)
                 scales = [scale * d * 3 / sum(density) for scale, d in zip(scales, density)]
                 wanted = net.local.join(torch.cat([*scales, features[b, c]])[None])[0]
                 assert torch.allclose(local[b, c], wanted, atol=1e-4)
@@ -231,7 +253,8 @@ def test_config_round_trip_and_invalid_values():
         make_pointnet_config(classes=("Car",))
     with pytest.raises(InputError, match="later version"):
         parse_config(config_module.PointNetConfig, {"wings": 2}, "")
-    for wrong in dict(radii=(0.4, 0.2, 0.1)), dict(centroids=500), dict(neighbours=(1, 2)):
+    for wrong in (dict(radii=(0.4, 0.2, 0.1)), dict(centroids=500), dict(neighbours=(1, 2)),
+                  dict(sampling="nearest"), dict(density="")):
         with pytest.raises(InputError):
             make_pointnet_config(**wrong)
 

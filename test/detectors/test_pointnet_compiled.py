@@ -32,7 +32,7 @@ def compiled_network(network):
 
 def assert_equal(config, clusters, seed=0):
     network = lively(config, seed)
-    inputs = make_network_input(clusters, config.points)
+    inputs = make_network_input(clusters, config.points, farthest=config.farthest)
     with torch.inference_mode():
         found, wanted = compiled_network(network)(inputs), run_network(network, inputs)
     for ours, theirs in zip(found, wanted):

@@ -176,12 +176,16 @@ def compute_centroids(points: np.ndarray, first: np.ndarray) -> np.ndarray:
     return sums / np.diff(first)[:, None]
 
 
-def make_network_input(clusters: Clusters, count: int, seed: int = 0) -> ClusterInput:
+def make_network_input(clusters: Clusters, count: int, seed: int = 0,
+                       farthest: int = 0) -> ClusterInput:
     """Make the network input from at most `count` random points of each cluster (Eq. 13).
 
-    The sample of a cluster depends on `seed` and on its own points, not on the other clusters.
+    The sample of a cluster depends on `seed` and on its own points, not on the other clusters. Its
+    first `farthest` points are in the order of farthest point sampling (Eq. 15 and 17): each is the
+    farthest from those before it.
     """
-    points, valid, low_high, centres = _sample_points(clusters.points, clusters.first, count, seed)
+    points, valid, low_high, centres = _sample_points(clusters.points, clusters.first, count, seed,
+                                                      farthest)
     azimuths = np.arctan2(centres[:, 1], centres[:, 0])
     reach = np.maximum(np.hypot(centres[:, 0], centres[:, 1]), 1e-3)
     inputs = np.empty((*points.shape[:2], 5), np.float32)
@@ -198,7 +202,7 @@ def make_network_input(clusters: Clusters, count: int, seed: int = 0) -> Cluster
 
 
 @njit(cache=True, nogil=True)
-def _sample_points(points, first, count, seed):
+def _sample_points(points, first, count, seed, farthest):
     clusters = len(first) - 1
     out = np.zeros((clusters, count, 4), np.float32)
     valid = np.zeros((clusters, count), np.bool_)
@@ -223,9 +227,28 @@ def _sample_points(points, first, count, seed):
             j = i + int((state >> np.uint64(33)) % np.uint64(size - i))
             indices[i], indices[j] = indices[j], indices[i]
             valid[k, i] = True
+        if farthest > 0:
+            _order_by_distance(own, indices[:kept], min(farthest, kept))
         for i in range(count):
             row = own[indices[i % kept]]
             for axis in range(3):
                 out[k, i, axis] = row[axis] - centres[k, axis]
             out[k, i, 3] = row[3]
     return out, valid, low_high, centres
+
+
+@njit(cache=True, nogil=True)
+def _order_by_distance(points, indices, count):
+    """Reorder indices in place: each of the first `count` is the farthest from those before it."""
+    nearest = np.full(len(indices), np.inf)
+    for done in range(1, count):
+        last, best = points[indices[done - 1]], done
+        for i in range(done, len(indices)):
+            squared = 0.0
+            for axis in range(3):
+                squared += (np.float64(points[indices[i], axis]) - last[axis]) ** 2
+            nearest[i] = min(nearest[i], squared)
+            if nearest[i] > nearest[best]:
+                best = i
+        indices[done], indices[best] = indices[best], indices[done]
+        nearest[done], nearest[best] = nearest[best], nearest[done]

@@ -134,6 +134,7 @@ class _Local:
 
     def __init__(self, config: PointNetConfig, weights: LayerWeights):
         self.shallow = config.point_channels[-1]  # width of the features of a point
+        self.in_ball = config.density == "ball"
         radii, counts = zip(*config.groups)
         self.radii, self.counts = np.array(radii, np.float32), np.array(counts)
         self.nets = [_layers(weights, f"local.nets.{i}", POINT, *config.group_channels)
@@ -146,7 +147,7 @@ class _Local:
         """Return features (R, C) of the centres of all clusters, and the first centre of each
         cluster (K + 1,)."""
         relative, starts, density, first_centre = kernels.grouped(rows, first, most, self.radii,
-                                                                  self.counts)
+                                                                  self.counts, self.in_ball)
         weights = density / density.sum(axis=1, keepdims=True) * np.float32(len(self.counts))
         scales = []
         for s, layers in enumerate(self.nets):

@@ -1,9 +1,9 @@
 """Configuration of paper C's improved PointNet, its ablations and baselines.
 
 Paper C (Zhang et al., PLOS One 2026, e0348581) defines the parts (Eq. 13 to 19) but gives no layer
-widths. The switches are those of its Table 5; PointNet and PointNet++ (SSG) are settings of the
-same network. A checkpoint contains the dataclass as JSON, so weights and architecture cannot get
-separated.
+widths; docs/explanation/papers.md lists departures from its equations. The switches are those of
+its Table 5; PointNet and PointNet++ (SSG) are settings of the same network. A checkpoint contains
+the dataclass as JSON, so weights and architecture cannot get separated.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from lidar_perception.ground.params import GroundParams
 from lidar_perception.types import CLASSES, InputError
 
 MAX_POINTS = 4096  # of a cluster, to bound computing time
+SAMPLINGS, DENSITIES = ("random", "farthest"), ("neighbours", "ball")
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,11 @@ class PointNetConfig:
         centroids, coarse: numbers of groups of points, and of groups of these centroids.
         radii, coarse_radius: of the groups, metres.
         neighbours, coarse_neighbours: maximum number of members of a group.
+        sampling: choice of the centroids among the points. random: the first ones. farthest: by
+            farthest point sampling (Eq. 15, 17).
+        density: weight of the features at each radius (Eq. 17). neighbours: members of the group
+            per radius, which are at most `neighbours`. ball: all points within the radius per
+            volume.
         point_channels, group_channels, local_channels, global_channels, head_channels: widths of
             the layers.
         yaw_bins: number of bins of the circle.
@@ -61,6 +67,8 @@ class PointNetConfig:
     neighbours: tuple[int, ...] = (8, 12, 16)
     coarse_radius: float = 1.2
     coarse_neighbours: int = 8
+    sampling: str = "random"
+    density: str = "neighbours"
     point_channels: tuple[int, ...] = (32, 64)
     group_channels: tuple[int, ...] = (32, 32)
     local_channels: int = 128
@@ -89,6 +97,9 @@ class PointNetConfig:
         if not max(self.coarse, self.coarse_neighbours) <= self.centroids <= self.points:
             raise ValueError("coarse and coarse_neighbours must be at most centroids, and these at "
                              "most points")
+        if self.sampling not in SAMPLINGS or self.density not in DENSITIES:
+            raise ValueError(f"sampling must be one of {', '.join(SAMPLINGS)}, and density one of "
+                             f"{', '.join(DENSITIES)}")
         if self.points > MAX_POINTS:
             raise ValueError(f"points are more than {MAX_POINTS}")
 
@@ -104,6 +115,11 @@ class PointNetConfig:
         if self.msg:
             return scales
         return scales[-1:] if self.grouped or self.mrg else ()
+
+    @property
+    def farthest(self) -> int:
+        """Number of points in the order of farthest point sampling, see make_network_input."""
+        return self.centroids if self.sampling == "farthest" else 0
 
     @property
     def least_points(self) -> int:
@@ -136,6 +152,9 @@ class Switches(TypedDict, total=False):
     mrg: bool
     skip: bool
     grouped: bool
+    radii: tuple[float, ...]
+    sampling: str
+    density: str
 
 
 PLAIN = Switches(msg=False, mrg=False, skip=False, grouped=False)
@@ -154,6 +173,14 @@ NETWORKS: dict[str, Switches] = {
     **ABLATIONS,
     "pointnet": PLAIN,
     "pointnet2": Switches(msg=False, mrg=False, skip=False),  # PointNet++, single-scale grouping
+    # The paper's Eq. 15 and 17 to the letter
+    "farthest": Switches(sampling="farthest"),
+    "ball-density": Switches(density="ball"),
+    "farthest-ball-density": Switches(sampling="farthest", density="ball"),
+    # Other radii than the paper's (0.1, 0.2, 0.4), Table 4
+    "radii-halved": Switches(radii=(0.05, 0.1, 0.2)),
+    "radii-doubled": Switches(radii=(0.2, 0.4, 0.8)),
+    "radii-quadrupled": Switches(radii=(0.4, 0.8, 1.6)),
 }
 
 

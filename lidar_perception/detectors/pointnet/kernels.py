@@ -49,17 +49,32 @@ def _nearest(points, begin, end, centre, count, distances, indices):
 
 
 @njit(cache=True, nogil=True)
-def grouped(points, first, most, radii, counts):
+def _count_within(points, begin, end, centre, squared_radius):
+    """Count the points among begin .. end whose squared distance from point number `centre` is at
+    most squared_radius."""
+    count = 0
+    for i in range(begin, end):
+        x = points[centre, 0] - points[i, 0]
+        y = points[centre, 1] - points[i, 1]
+        z = points[centre, 2] - points[i, 2]
+        count += x * x + y * y + z * z <= squared_radius
+    return count
+
+
+@njit(cache=True, nogil=True)
+def grouped(points, first, most, radii, counts, in_ball):
     """Group points (P, 5 or more) around the first `most` points of each cluster.
 
     Args:
         radii, counts: (S,) float32 and int64, ascending radius and maximum size of the groups of
             each scale. A group contains the nearest points.
+        in_ball: bool, the density counts all points within the radius.
 
     Returns:
         For each scale, relative points (S, R, 8) float32, x y z in units of the radius and two more
         numbers, padded with zeros; first rows of the groups (S, C + 1); density (C, S) float32, the
-        size of a group relative to counts x radius; and the first centre of each cluster (K + 1,).
+        size of a group relative to counts x radius, or the points in the ball relative to radius
+        cubed; and the first centre of each cluster (K + 1,).
     """
     clusters, scales = len(first) - 1, len(radii)
     first_centre = np.zeros(clusters + 1, np.int64)
@@ -84,7 +99,11 @@ def grouped(points, first, most, radii, counts):
                             relative[s, row, axis] = (near[axis] - points[centre, axis]) / radius
                         relative[s, row, 3], relative[s, row, 4] = near[3], near[4]
                         row += 1
-                density[c, s] = (row - starts[s, c]) / (counts[s] * radius)
+                if in_ball:
+                    inside = _count_within(points, first[k], first[k + 1], centre, radius * radius)
+                    density[c, s] = inside / (radius * radius * radius)
+                else:
+                    density[c, s] = (row - starts[s, c]) / (counts[s] * radius)
                 starts[s, c + 1] = row
     return relative, starts, density, first_centre
 

@@ -1,4 +1,5 @@
-"""The network of paper C, the improved PointNet (Eq. 13 to 17), its ablations and baselines.
+"""The network of paper C, the improved PointNet (Eq. 13 to 17, see config.py for the options), its
+ablations and baselines.
 
     points -> PointMlp --------------------------+-> raw ----------------+
                  +-> LocalNet (MSG, Eq. 14) -> max -> fine --------------+-> head -> class, box
@@ -58,19 +59,22 @@ def mlp(*channels: int) -> nn.Sequential:
     return nn.Sequential(*(LinearNormRelu(a, b) for a, b in pairwise(channels)))
 
 
-def nearest(centres: Tensor, xyz: Tensor, valid: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the `count` nearest points of xyz (B, N, 3) to each of the centres (B, M, 3).
+def squared_distances(centres: Tensor, xyz: Tensor, valid: Tensor) -> Tensor:
+    """Return (B, M, N) of centres (B, M, 3) to points xyz (B, N, 3); inf to points not valid."""
+    # Differences instead of a matrix product keep the distance of a point to itself exactly 0.
+    # Separate axes: a sum over an axis of length 3 takes four times as long.
+    x, y, z = ((a[:, :, None] - b[:, None]).square() for a, b in zip(centres.unbind(-1),
+                                                                     xyz.unbind(-1)))
+    return (x + y + z).masked_fill(~valid[:, None], torch.inf)
+
+
+def nearest(squared: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the `count` nearest points to each centre by squared distances (B, M, N).
 
     Returns:
         Squared distances (B, M, k), ascending, inf if there are fewer than k valid points; and
         indices (B, M, k).
     """
-    # Differences instead of a matrix product keep the distance of a point to itself exactly 0.
-    # Separate axes: a sum over an axis of length 3 takes four times as long.
-    x, y, z = ((a[:, :, None] - b[:, None]).square() for a, b in zip(centres.unbind(-1),
-                                                                     xyz.unbind(-1)))
-    squared = x + y + z                                                    # (B, M, N)
-    squared = squared.masked_fill(~valid[:, None], torch.inf)
     return squared.topk(count, dim=2, largest=False)
 
 
@@ -88,22 +92,24 @@ class LocalNet(nn.Module):
     """
 
     def __init__(self, groups: Sequence[tuple[float, int]], channels: Sequence[int],
-                 point_channels: int, out: int):
+                 point_channels: int, out: int, density: str):
         super().__init__()
-        self.groups = list(groups)
+        self.groups, self.density = list(groups), density
         self.nets = nn.ModuleList(mlp(POINT, *channels) for _ in groups)
         self.join = mlp(len(groups) * channels[-1] + point_channels, out)
 
     def forward(self, points: Tensor, features: Tensor, valid: Tensor, count: int) -> Tensor:
         xyz, centres = points[..., :3], points[:, :count, :3]
-        squared, indices = nearest(centres, xyz, valid, max(k for _, k in self.groups))
+        distances = squared_distances(centres, xyz, valid)                 # (B, M, N)
+        squared, indices = nearest(distances, max(k for _, k in self.groups))
         scales, density = [], []
         for (radius, k), net in zip(self.groups, self.nets):
             within = squared[..., :k] <= radius * radius                   # (B, M, k)
             near = gather_rows(points, torch.where(within, indices[..., :k], indices[..., :1]))
             around = (near[..., :3] - centres[:, :, None]) / radius        # (B, M, k, 3)
             scales.append(net(torch.cat([around, near[..., 3:]], dim=-1)).amax(dim=2))
-            density.append(within.sum(dim=-1) / (k * radius))
+            density.append(within.sum(dim=-1) / (k * radius) if self.density == "neighbours" else
+                           (distances <= radius * radius).sum(dim=-1) / radius**3)
         weights = torch.stack(density, dim=-1)                             # (B, M, scales)
         weights = weights / weights.sum(dim=-1, keepdim=True) * len(self.groups)
         scales = [scale * weights[..., i:i + 1] for i, scale in enumerate(scales)]
@@ -120,7 +126,7 @@ class CoarseNet(nn.Module):
 
     def forward(self, xyz: Tensor, features: Tensor, valid: Tensor, count: int) -> Tensor:
         centres = xyz[:, :count]
-        squared, indices = nearest(centres, xyz, valid, self.neighbours)
+        squared, indices = nearest(squared_distances(centres, xyz, valid), self.neighbours)
         indices = torch.where(squared <= self.radius**2, indices, indices[..., :1])
         around = (gather_rows(xyz, indices) - centres[:, :, None]) / self.radius
         layer = self.net[0]
@@ -147,7 +153,8 @@ class PointNet(nn.Module):
         self.fine: nn.Module | None = None
         found = 0
         if config.groups:
-            self.local = LocalNet(config.groups, config.group_channels, shallow, local)
+            self.local = LocalNet(config.groups, config.group_channels, shallow, local,
+                                  config.density)
             self.fine = mlp(local, wide)
             found += wide
         if config.mrg:

@@ -78,7 +78,7 @@ def predict(network: Network, clusters: Clusters, seed: int = 0,
     if len(clusters) == 0:
         return Predictions(np.zeros((0, classes + 1), np.float32), np.zeros(0, np.int64),
                            np.zeros((0, 7), np.float32))
-    inputs = make_network_input(clusters, config.points, seed)
+    inputs = make_network_input(clusters, config.points, seed, config.farthest)
     outputs = network(inputs)
     calibrated = compute_probabilities(outputs.logits, network.temperature, network.offsets)
     if labels is None:

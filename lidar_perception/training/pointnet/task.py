@@ -94,7 +94,8 @@ class ClusterPreparation:
             clusters.points[own], _ = vary_thing(clusters.points[own], feet[k], self.augment,
                                                  rng)
         clusters, boxes = augment_clusters(clusters, boxes, scene.loose[chosen], self.augment, rng)
-        inputs = make_network_input(clusters, self.config.points, int(rng.integers(1 << 30)))
+        inputs = make_network_input(clusters, self.config.points, int(rng.integers(1 << 30)),
+                                    self.config.farthest)
         has_box = (labels >= 0) & (labels < len(self.config.classes))
         classes = np.where(has_box, labels, 0)
         targets = encode(boxes, classes, inputs.centres, inputs.azimuths, self.config)
@@ -237,7 +238,8 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
     sizes = np.concatenate([s.clusters.sizes for s in scenes])
     if len(labels):
         logits = torch.cat([
-            run_network(network, make_network_input(s.clusters, config.points)).logits.cpu()
+            run_network(network, make_network_input(s.clusters, config.points,
+                                                    farthest=config.farthest)).logits.cpu()
             for s in scenes if len(s.clusters)])
         calibrate(network, logits, torch.from_numpy(labels))
     report, predictions = DetectionReport(), []
