@@ -81,7 +81,7 @@ setup(
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["lidar_perception*", "lidar_studio*", "msg_utils*"]),
     package_data={
-        NAME: ["py.typed", "nodes/*.xml", "candidates/*.json", "*/*.html", "*/*/*.html",
+        NAME: ["py.typed", "nodes/*.xml", "candidates/*.json",
                "simulation/sensors/*.yaml", "detectors/fused/*.json",
                "detectors/pointnet/weights/*", "detectors/pointpillars/weights/pointpillars_v4_*"],
         "lidar_studio": ["py.typed", "page/*"],
@@ -96,7 +96,7 @@ setup(
         (f"lib/{NAME}", glob("scripts/nodes/*")),  # where ros2 run looks, and nowhere else
     ],
     install_requires=[
-        "click>=8.1", "jinja2>=3.1", "matplotlib>=3.7", "lz4>=4.0", "mcap>=1.2",
+        "click>=8.1", "matplotlib>=3.7", "lz4>=4.0", "mcap>=1.2",
         "numba>=0.59", "numpy>=1.26", "pillow>=9.4", "pyyaml>=6", "rich>=13",
         "rosbags>=0.11.6", "ruamel.yaml.clib>=0.2.12", "safetensors>=0.4", "scikit-learn>=1.3",
         "scipy>=1.11", "threadpoolctl>=3.1", "torch>=2.2", "zstandard>=0.21",

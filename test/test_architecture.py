@@ -33,7 +33,7 @@ STRANGERS = {
     "classes": [], "intensity": ["numpy"], "types": ["numpy"], "param_fields": [],
     "geometry": ["numpy", "numba"], "camera": NUMBERS,
     "groups": ["numpy"], "robot": ["numpy", "scipy"],
-    "runs": ["rich", "jinja2", "threadpoolctl", "numba"],
+    "runs": ["rich", "threadpoolctl", "numba"],
     "wire": ["numpy", "scipy", "rosbags", "msg_utils", "lz4", "zstandard"],
     "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils", "lz4", "zstandard"],
     "ground": NUMBERS, "clustering": NUMBERS, "candidates": NUMBERS,
@@ -41,7 +41,7 @@ STRANGERS = {
                   "onnxscript"],
     "tracking": [*NUMBERS, "kiss_icp"],
     "rendering": ["numpy", "PIL", "matplotlib", "av", "msg_utils"],
-    "sensor_setup": ["numpy", "scipy", "matplotlib", "msg_utils"],
+    "sensor_setup": ["numpy", "scipy", "msg_utils"],
     "labels": ["numpy", "msg_utils"], "params": [],
 }
 

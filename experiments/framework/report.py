@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import dataclasses
 import io
@@ -20,7 +21,6 @@ from experiments.framework.experiment import Cell, Experiment, Figure, Section, 
 from experiments.framework.figures import draw_figure
 from experiments.framework.report_files import REPORT
 from lidar_perception.runs.files import write_bytes, write_text
-from lidar_perception.runs.page import render_page, to_data_url
 
 LEGEND = ("A value, [its 95 % interval] by a bootstrap over frames, and the paper's value. An "
           "interval from few frames, or from frames that all agree, is too narrow.")
@@ -88,13 +88,17 @@ def is_number(cell: str | Cell) -> bool:
 def to_html(experiment: Experiment, sections: list[Section], about: dict[str, str],
             skipped: list[dict[str, Any]]) -> str:
     """Return the report as one HTML page that needs no other file."""
-    def make_picture(figure: Figure, dark: bool) -> str:
-        return to_data_url(draw_figure(figure, "svg", dark=dark), "svg+xml")
+    import jinja2
 
-    return render_page(
-        Path(__file__).with_name("report.html"), title=experiment.title,
-        question=experiment.question, about=about, skipped=skipped, sections=sections,
-        legend=LEGEND, max_rows=MAX_ROWS, format_cell=format_cell,
+    def make_picture(figure: Figure, dark: bool) -> str:
+        content = base64.b64encode(draw_figure(figure, "svg", dark=dark)).decode()
+        return f"data:image/svg+xml;base64,{content}"
+
+    template = jinja2.Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"),
+                               autoescape=True, undefined=jinja2.StrictUndefined)
+    return template.render(
+        title=experiment.title, question=experiment.question, about=about, skipped=skipped,
+        sections=sections, legend=LEGEND, max_rows=MAX_ROWS, format_cell=format_cell,
         make_picture=make_picture, is_number=is_number)
 
 

@@ -17,10 +17,8 @@ from lidar_perception.runs.files import make_folder, write_text
 from lidar_perception.runs.terminal import console, errors, make_progress, show_scanning
 from lidar_perception.types import InputError
 
-FILES = ("sensor.yaml", "robot.param.yaml", "report.html", "lidar_perception.rviz",
-         "foxglove_layout.json")
+FILES = ("sensor.yaml", "robot.param.yaml", "lidar_perception.rviz", "foxglove_layout.json")
 COLORS = {"high": "green", "fair": "default", "low": "yellow"}
-HINT_TOLERANCE_M = 0.1
 
 
 @click.command(cls=Command)
@@ -38,9 +36,9 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
           force: bool) -> None:
     """Measure a LiDAR, its mounting and the robot's body from unlabelled clouds.
 
-    Writes sensor.yaml, which `simulate --sensor` and `train --sensor` take, robot.param.yaml for
-    the nodes, layouts for RViz and Foxglove, and report.html, which has the method and the
-    confidence of each value. Works best with some minutes of driving in open space.
+    Prints each value with its confidence, and warnings with remedies. Writes sensor.yaml, which
+    `simulate --sensor` and `train --sensor` take, robot.param.yaml for the nodes, and layouts for
+    RViz and Foxglove. Works best with some minutes of driving in open space.
 
     \b
     Examples:
@@ -56,7 +54,6 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
     from lidar_perception.sensor_setup.measurement.recorded_poses import read_recorded_poses
     from lidar_perception.sensor_setup.measurement.scans import read_scan
     from lidar_perception.sensor_setup.report.files import format_params, format_sensor
-    from lidar_perception.sensor_setup.report.page import format_page
     from lidar_perception.sensor_setup.report.values import list_values
     from lidar_perception.sensor_setup.report.warnings import find_warnings
 
@@ -69,7 +66,7 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
     numbers, found, skipped = [], [], []
     chosen = choose_clouds(clouds.count, scans)
     with make_progress() as bar:
-        task = bar.add_task("reading", total=len(chosen) + 2)
+        task = bar.add_task("reading", total=len(chosen) + 1)
         for i in chosen:
             try:
                 found.append(read_scan(clouds.load(i), f"cloud {i} of {data}"))
@@ -83,27 +80,17 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
         recorded = read_recorded_poses(clouds.poses, numbers, clouds.stamps_ns)
         m = measure_sensor(found, numbers, str(data), clouds.count, clouds.stamps_ns, recorded,
                            height_hint)
-        bar.update(task, description="drawing", advance=1)
-        texts = {"sensor.yaml": format_sensor(m), "robot.param.yaml": format_params(m)}
-        page = format_page(m, texts)
+    files = {"sensor.yaml": format_sensor(m), "robot.param.yaml": format_params(m),
+             **_layouts(clouds.topic or "/points", m.source.scans[0].frame_id)}
     make_folder(out)
-    for name, text in {**texts, "report.html": page,
-                       **_layouts(clouds.topic or "/points", m.source.scans[0].frame_id)}.items():
+    for name, text in files.items():
         write_text(out / name, text)
     _print_values(list_values(m))
     for line in skipped:
         console.print(Text("left out", "yellow") + f": {line}")
-    for line in find_warnings(m) + _check_hint(m, height_hint):
+    for line in find_warnings(m):
         console.print(Text("warning", "yellow") + f": {line}")
-    console.print(f"{out}: {', '.join(name for name in FILES if (out / name).exists())}")
-
-
-def _check_hint(m: Any, height: float | None) -> list[str]:
-    mount = m.mounting.mount
-    if height is None or mount is None or abs(mount.height - height) < HINT_TOLERANCE_M:
-        return []
-    return [f"the sensor is {mount.height:.2f} m above the ground and not {height:g}: measure it "
-            "by hand, or check the fitted plane in the report"]
+    console.print(f"{out}: {', '.join(files)}")
 
 
 def _print_values(rows: list[Any]) -> None:

@@ -1,1 +1,1 @@
-"""Measurement of a LiDAR and its mounting from clouds, and the files and the report about it."""
+"""Measurement of a LiDAR and its mounting from clouds, and the files that describe them."""

@@ -53,8 +53,6 @@ def test_every_file_is_written_and_readable(robot):
     assert params.ground.sensor_pose.pitch == pytest.approx(0.1396, abs=0.0035)
     assert params.input.intensity_max == 255
     assert params.resolution.elevation_step == pytest.approx(2)
-    page = (robot / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 5 and "src=\"http" not in page
     layout = (robot / "foxglove_layout.json").read_text()
     assert '"/lidar/points"' in layout and json.loads(layout)
     assert "Fixed Frame: lidar\n" in (robot / "lidar_perception.rviz").read_text()

@@ -1,10 +1,8 @@
 """Simulated data sets: documented properties of scans, and reading from every layout."""
 
-import itertools
 
 import numpy as np
 import pytest
-import torch
 from simulate_samples import TINY, run
 
 from lidar_perception.data.kitti import write as write_kitti
@@ -12,12 +10,11 @@ from lidar_perception.data.kitti.labels import read_object_labels, read_tracking
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.semantickitti import MOVING, THINGS
 from lidar_perception.geometry import box_corners, points_in_box, wrap_angle
-from lidar_perception.simulation.batch import generate_training_scans
 from lidar_perception.simulation.camera import FORWARD_CAMERA, make_kitti_labels
 from lidar_perception.simulation.drive import simulate_drive, simulate_scan
 from lidar_perception.simulation.scene import CROWDED_ZONES
 from lidar_perception.simulation.sensor import SENSORS
-from lidar_perception.types import SENSOR_HEIGHT, InputError
+from lidar_perception.types import SENSOR_HEIGHT
 
 pytestmark = [pytest.mark.no_cover,  # others run these lines
               pytest.mark.usefixtures("streets", "tiny_sensor")]
@@ -210,38 +207,3 @@ def test_labels_without_objects_read_back(tmp_path):
     text = write_kitti.format_tracking_labels(0, nothing, FORWARD_CAMERA)
     (tmp_path / "0000.txt").write_text(text)
     assert read_tracking_labels(tmp_path / "0000.txt", np.eye(4)) == {}
-
-
-def test_training_scans_are_streets_in_order():
-    for street, batch in zip((3, 4, 5), generate_training_scans(3, TINY)):
-        scan = simulate_scan(street, 0, TINY)
-        assert batch["points"].dtype == batch["boxes"].dtype == torch.float32
-        assert np.array_equal(batch["points"][:, :3], scan.frame.xyz)
-        assert np.array_equal(batch["points"][:, 3], scan.frame.intensity)
-        assert np.allclose(batch["boxes"], scan.truth.boxes)
-        assert batch["class_ids"].tolist() == scan.truth.class_ids.tolist()
-        assert batch["num_points"].tolist() == [e["num_points"] for e in scan.truth.extras]
-
-
-def test_training_scans_share_a_street_between_moments():
-    scans = [(street, frame) for street in (3, 4) for frame in (0, 66, 133)]
-    for (street, frame), batch in zip(scans, generate_training_scans(3, TINY, moments=3)):
-        scan = simulate_scan(street, frame, TINY)
-        assert np.array_equal(batch["points"][:, :3], scan.frame.xyz)
-        assert np.allclose(batch["boxes"], scan.truth.boxes)
-    with pytest.raises(InputError, match="moments = 0 must be 1"):
-        generate_training_scans(3, TINY, moments=0)
-
-
-class Streets(torch.utils.data.IterableDataset):
-    """Data set that a user writes for a DataLoader."""
-
-    def __iter__(self):
-        return itertools.islice(generate_training_scans(3, TINY), 2)
-
-
-def test_loader_workers_share_streets():
-    expected = sorted(batch["points"].numpy().tobytes()
-                      for batch in itertools.islice(generate_training_scans(3, TINY), 4))
-    loader = torch.utils.data.DataLoader(Streets(), batch_size=None, num_workers=2)
-    assert sorted(batch["points"].numpy().tobytes() for batch in loader) == expected

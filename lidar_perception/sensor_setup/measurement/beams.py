@@ -260,8 +260,8 @@ def measure_azimuth_step(scans: Sequence[Scan], beams: Beams) -> tuple[float, fl
     return float(np.median(steps)), float(np.median(doubles))
 
 
-def measure_range_noise(scans: Sequence[Scan], beams: Beams, step: float) -> tuple[float, int]:
-    """Return the standard deviation of ranges about smooth surfaces in m, and the pieces used.
+def measure_range_noise(scans: Sequence[Scan], beams: Beams, step: float) -> float:
+    """Return the standard deviation of ranges about smooth surfaces in m; NaN if unknown.
 
     A parabola is fitted to pieces of PIECE_POINTS neighbouring returns of a beam. Pieces on rough
     surfaces scatter more, so the peak of the distribution counts.
@@ -287,7 +287,7 @@ def measure_range_noise(scans: Sequence[Scan], beams: Beams, step: float) -> tup
     scatter = np.concatenate(found) if found else np.zeros(0)
     scatter = scatter[(scatter > 1e-4) & (scatter < 1.0)]
     if len(scatter) < 50:
-        return np.nan, len(scatter)
+        return np.nan
     counts, edges = np.histogram(np.log(scatter), 60, (np.log(1e-4), 0.0))
     peak = gaussian_filter1d(counts.astype(float), 1.5).argmax()
-    return float(np.exp((edges[peak] + edges[peak + 1]) / 2)), len(scatter)
+    return float(np.exp((edges[peak] + edges[peak + 1]) / 2))

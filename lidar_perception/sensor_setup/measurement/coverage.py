@@ -44,8 +44,8 @@ class Coverage(NamedTuple):
         box: (6,) box around the body's points, lower then upper corner, m; empty without any.
         foreign_share: Share of the points in the box that are not the body's.
         body_share: Share of all points that are the body's.
-        has_walls: More is constant around the robot than a robot has, as walls along its path are,
-            so only returns within NEAR_BODY_M count as body.
+        has_walls: More returns are constant than a robot's body has, as with walls along its path.
+            Then only returns within NEAR_BODY_M count as body.
         still: The robot stood still; None if unknown.
         blocked: (first row, from, to) of blind sectors, degrees counter-clockwise.
         view: (from, to) of the azimuths with returns, degrees.
@@ -70,8 +70,8 @@ class Coverage(NamedTuple):
             or float(np.abs(self.box).max()) < NEAR_BODY_M)
 
 
-class Nearest(NamedTuple):
-    """Nearest returns of S scans by R rows and 360 sectors.
+class NearestReturns(NamedTuple):
+    """NearestReturns returns of S scans by R rows and 360 sectors.
 
     Attributes:
         rows: (R,) elevations, see Coverage.
@@ -84,7 +84,7 @@ class Nearest(NamedTuple):
     ranges: np.ndarray
 
 
-def find_nearest(scans: Sequence[Scan], beams: Beams | None) -> Nearest:
+def find_nearest_returns(scans: Sequence[Scan], beams: Beams | None) -> NearestReturns:
     """Return the nearest returns of each scan."""
     rows, labels = _assign_rows(scans, beams)
     ranges = np.full((len(scans), len(rows), SECTORS), np.inf, np.float32)
@@ -92,12 +92,12 @@ def find_nearest(scans: Sequence[Scan], beams: Beams | None) -> Nearest:
         known = label >= 0
         np.minimum.at(image, (label[known], _to_sectors(scan)[known]),
                       scan.range[known].astype(np.float32))
-    return Nearest(rows, labels, ranges)
+    return NearestReturns(rows, labels, ranges)
 
 
-def measure_coverage(scans: Sequence[Scan], nearest: Nearest, mount: Mount | None,
+def measure_coverage(scans: Sequence[Scan], nearest: NearestReturns, mount: Mount | None,
                      still: bool | None) -> Coverage:
-    """Measure what all scans together see.
+    """Measure the coverage of all scans together.
 
     Args:
         scans: The scans.
@@ -168,7 +168,7 @@ def _look_up(scan: Scan, labels: np.ndarray, cells: np.ndarray, default: float) 
 
 
 def is_standing_still(ranges: np.ndarray) -> bool | None:
-    """Return True if far returns are mostly constant.
+    """Return True if far returns are mostly constant, so that the robot stands still.
 
     Args:
         ranges: (S, R, 360) ranges in m of S scans, inf without a return.

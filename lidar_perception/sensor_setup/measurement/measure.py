@@ -19,7 +19,7 @@ from lidar_perception.sensor_setup.measurement.beams import (
 )
 from lidar_perception.sensor_setup.measurement.coverage import (
     Coverage,
-    find_nearest,
+    find_nearest_returns,
     is_standing_still,
     measure_coverage,
 )
@@ -82,18 +82,14 @@ class ScanPattern(NamedTuple):
         azimuth_step: Degrees, NaN without beams.
         second_returns: Share of the points that are second returns.
         range_noise: Metres, NaN if unknown.
-        noise_pieces: Number of pieces that the noise was measured on.
         model: Sensor of config/sensors with such beams, "" for none.
-        model_error: Median difference to its beams in degrees.
     """
 
     beams: Beams | None
     azimuth_step: float
     second_returns: float
     range_noise: float
-    noise_pieces: int
     model: str
-    model_error: float
 
     @property
     def is_moved(self) -> bool:
@@ -186,7 +182,7 @@ def measure_sensor(scans: Sequence[Scan], numbers: Sequence[int], source: str, t
     require_3d(np.concatenate([scan.elevation for scan in scans]), source)
     pattern = _measure_pattern(scans)
     mount = measure_mount(scans)
-    nearest = find_nearest(scans, pattern.beams)
+    nearest = find_nearest_returns(scans, pattern.beams)
     # On a field, the uniform surroundings of a moving robot look constant.
     still = False if recorded.distance >= MIN_POSE_MOTION_M else is_standing_still(nearest.ranges)
     heading = _find_heading(scans, numbers, mount, still, recorded)
@@ -204,11 +200,11 @@ def measure_sensor(scans: Sequence[Scan], numbers: Sequence[int], source: str, t
 
 def _measure_pattern(scans: Sequence[Scan]) -> ScanPattern:
     beams = find_beams(scans)
-    step, second_returns, noise, pieces = np.nan, 0.0, np.nan, 0
+    step, second_returns, noise = np.nan, 0.0, np.nan
     if beams is not None:
         step, second_returns = measure_azimuth_step(scans, beams)
-        noise, pieces = measure_range_noise(scans, beams, step)
-    return ScanPattern(beams, step, second_returns, noise, pieces, *match_model(beams))
+        noise = measure_range_noise(scans, beams, step)
+    return ScanPattern(beams, step, second_returns, noise, match_model(beams))
 
 
 def _measure_view(scans: Sequence[Scan], coverage: Coverage) -> View:
@@ -254,15 +250,11 @@ def _measure_distance(scans: Sequence[Scan], mount: Mount | None, heading: Headi
     return np.nan if shift is None else float(np.maximum(heading.distance, np.hypot(*shift)))
 
 
-def match_model(beams: Beams | None) -> tuple[str, float]:
-    """Find the sensor of config/sensors that has these beams, or most of them.
-
-    Returns:
-        Its name, "" for none, and the median difference of the beams in degrees.
-    """
+def match_model(beams: Beams | None) -> str:
+    """Return the sensor of config/sensors that has these beams, or most of them; "" for none."""
     best, error = "", MAX_MODEL_ERROR
     if beams is None:
-        return best, np.nan
+        return best
     for name in SENSOR_NAMES:
         elevations = np.degrees(find_sensor(name).elevations)
         if find_sensor(name).wander or not (
@@ -275,4 +267,4 @@ def match_model(beams: Beams | None) -> tuple[str, float]:
             error, MAX_PARTIAL_ERROR * float(np.median(-np.diff(elevations))))
         if np.median(difference) < limit and np.percentile(difference, 90) < 5 * MAX_MODEL_ERROR:
             best, error = name, float(np.median(difference))
-    return best, error if best else np.nan
+    return best

@@ -41,7 +41,6 @@ class Heading(NamedTuple):
     Attributes:
         degrees: Angle from the cloud's x axis, counter-clockwise; NaN if unknown.
         error: Standard error of the angle in degrees.
-        pairs: Number of pairs of scans that show it.
         distance: Longest shift in metres, NaN if most are not clear.
         problem: Why the heading is unknown, "" if it is known.
         from_base: It is the base's x axis, in whichever direction the robot drove.
@@ -49,7 +48,6 @@ class Heading(NamedTuple):
 
     degrees: float
     error: float
-    pairs: int
     distance: float
     problem: str
     from_base: bool = False
@@ -182,10 +180,10 @@ def estimate_heading(shifts: Shifts, base: Shifts) -> Heading:
            if shift is not None and np.hypot(*shift) >= MIN_SHIFT_M}
     distance = float(np.abs(every).max(initial=0.0))
     if not far and 2 * len(every) <= len(shifts):
-        return Heading(np.nan, np.nan, 0, np.nan, "the surroundings have too few features, or too "
+        return Heading(np.nan, np.nan, np.nan, "the surroundings have too few features, or too "
                        "similar ones, to see how the robot moved")
     if not far:
-        return Heading(np.nan, np.nan, 0, distance, f"the robot moved only {distance:.1f} m "
+        return Heading(np.nan, np.nan, distance, f"the robot moved only {distance:.1f} m "
                        "between the clouds that were compared")
     by_base = {pair: far[pair] / complex(*step) for pair, step in base.items()
                if pair in far and step is not None and np.hypot(*step) >= MIN_SHIFT_M / 2}
@@ -196,8 +194,8 @@ def estimate_heading(shifts: Shifts, base: Shifts) -> Heading:
         problem = ("the motion in the clouds and in the odometry does not agree" if by_base else
                    f"the robot turned, or drove to and fro: {len(turns)} shifts have different "
                    "directions")
-        return Heading(np.nan, np.nan, len(turns), distance, problem, bool(by_base))
+        return Heading(np.nan, np.nan, distance, problem, bool(by_base))
     error = max(float(np.degrees(np.sqrt(-2 * np.log(agreement)) / np.sqrt(len(turns)))),
                 MIN_ERROR)
-    return Heading(float(np.degrees(np.angle(mean))), error, len(turns), distance, "",
+    return Heading(float(np.degrees(np.angle(mean))), error, distance, "",
                    bool(by_base))

@@ -22,7 +22,6 @@ MAX_MEDIAN_RANGE_M = 250.0  # of a cloud in metres, in the sensor's frame
 MAX_SPREAD_M = 200.0  # median distance to the cloud's centre if it is in metres in another frame
 MIN_ELEVATION_SPAN = 1.0  # degrees; a sensor with less scans a plane
 MIN_POINTS = 100    # usable points of a cloud
-RETROREFLECTOR = 0.9  # of the full intensity; brighter returns are from retroreflectors
 
 
 class Scan(NamedTuple):
@@ -127,9 +126,6 @@ class IntensityScale(NamedTuple):
         whole: All values are whole numbers.
         greatest: Greatest value.
         zeros: Share of returns with intensity 0.
-        bright: Share of returns from RETROREFLECTOR of full on.
-        quantiles: (101,) percentiles.
-        histogram: (51,) counts over 0 .. full.
     """
 
     full: float
@@ -137,13 +133,10 @@ class IntensityScale(NamedTuple):
     whole: bool
     greatest: float
     zeros: float
-    bright: float
-    quantiles: np.ndarray
-    histogram: np.ndarray
 
 
 def measure_intensity(scans: Sequence[Scan]) -> IntensityScale | None:
-    """Return the distribution of intensities; None without any, or if all are equal."""
+    """Return the scale of the intensities; None without any, or if all are equal."""
     found = [scan.intensity for scan in scans if scan.intensity is not None]
     values = np.concatenate(found) if found else np.zeros(0)
     values = values[np.isfinite(values)]
@@ -156,8 +149,5 @@ def measure_intensity(scans: Sequence[Scan]) -> IntensityScale | None:
     full = infer_full_scale(values, np.int64 if whole else values.dtype)
     if greatest > MAX_UNIT * full:
         full = greatest
-    bright = float((values >= RETROREFLECTOR * full).mean())
     return IntensityScale(full, full <= 1.0 or greatest > 0.5 * full, whole, greatest,
-                          float((values == 0).mean()), bright,
-                          np.percentile(values, np.arange(101)),
-                          np.histogram(values, 51, (0.0, full))[0])
+                          float((values == 0).mean()))

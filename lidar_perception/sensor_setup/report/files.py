@@ -10,11 +10,7 @@ import numpy as np
 
 from lidar_perception.sensor_setup.measurement.measure import MIN_OUTDOOR_RANGE_M, SensorMeasurement
 from lidar_perception.sensor_setup.measurement.sensor_model import make_sensor
-from lidar_perception.sensor_setup.report.params import (
-    HINT_REASON,
-    choose_node_params,
-    format_value,
-)
+from lidar_perception.sensor_setup.report.params import HINT_REASON, choose_params, format_value
 from lidar_perception.sensor_setup.report.warnings import find_warnings
 from lidar_perception.simulation.sensor import Sensor
 
@@ -53,7 +49,7 @@ def format_sensor(m: SensorMeasurement) -> str:
 
 def format_params(m: SensorMeasurement) -> str:
     """Return the text of robot.param.yaml, with the reason of each parameter."""
-    chosen = choose_node_params(m)
+    chosen = choose_params(m)
     lines = [_format_header(m, f"{_describe_origin(m)} All other parameters keep their defaults. "
                             "Nodes ignore parameters that they do not have."), "/**:"]
     tree: dict[str, Any] = {}

@@ -33,7 +33,7 @@ HINT_REASON = "from --height-hint; no ground in view"
 
 
 def choose_params(m: SensorMeasurement) -> Reasons:
-    """Choose parameters of PipelineParams for the sensor and its mount, except defaults.
+    """Choose parameters of the nodes for the sensor and its mount, except defaults.
 
     Raises:
         InputError: A value is out of the range of its parameter.
@@ -79,12 +79,7 @@ def choose_params(m: SensorMeasurement) -> Reasons:
     except ValueError as error:
         raise InputError(f"{m.source.name}: the measured values are out of range: {error}; give "
                          "clouds, in metres, of a sensor on a robot or a vehicle") from None
-    return chosen
-
-
-def choose_node_params(m: SensorMeasurement) -> Reasons:
-    """Choose the parameters of choose_params and those that only nodes have."""
-    heading, recorded, chosen = m.mounting.heading, m.mounting.recorded, choose_params(m)
+    heading, recorded = m.mounting.heading, m.mounting.recorded
     if heading is not None and heading.is_off_axis and not heading.may_be_reversed:
         agrees = abs(wrap_degrees(recorded.heading - heading.degrees)) <= MAX_OFF_AXIS
         chosen["input.ahead"] = (

@@ -14,7 +14,7 @@ MAX_SLOPE_SPREAD = 1.0  # degrees from scan to scan, beyond which the ground slo
 MAX_HEIGHT_M = 5.0      # more than robots have
 MAX_TILT = 6.0          # degrees of roll or pitch; more is the mount, or a slope
 MAX_TILT_DIFFERENCE = 2.0  # degrees between TF and ground beyond the error, as for road camber
-MAX_HEIGHT_DIFFERENCE_M = 0.1
+MAX_HEIGHT_DIFFERENCE_M = 0.1  # between the ground and TF or --height-hint
 MAX_MISSING_SHARE = 0.01  # of the clouds
 MIN_GROUND_SHARE = 0.9    # of the scans
 MIN_TURN_S = 0.02         # shorter times of the points span no turn
@@ -81,8 +81,12 @@ def _check_mount(m: SensorMeasurement) -> list[str]:
     warnings = []
     if mount.height > MAX_HEIGHT_M:
         warnings.append(f"the ground that was found is {mount.height:.1f} m away: it may be a wall "
-                        "next to a sensor that is mounted on its side; check the report, and set "
-                        "ground.sensor_pose by hand")
+                        "next to a sensor that is mounted on its side; set ground.sensor_pose by "
+                        "hand")
+    hint = m.mounting.height_hint
+    if hint is not None and abs(mount.height - hint) >= MAX_HEIGHT_DIFFERENCE_M:
+        warnings.append(f"the sensor is {mount.height:.2f} m above the ground and not {hint:g}, as "
+                        "--height-hint says: measure it by hand")
     if mount.upside_down:
         warnings.append("the ground is in the direction of the sensor's z axis: the sensor is "
                         "mounted upside down, as ground.sensor_pose.roll says; if only the "
@@ -205,11 +209,11 @@ def _check_view(m: SensorMeasurement) -> list[str]:
     if coverage.has_walls:
         warnings.append("more is constant around the robot than a body, such as walls and ceilings "
                         "along its path, so no crop.body and no sector hidden by it is set; record "
-                        "a drive through an open place, or set crop.body by hand with the report")
+                        "a drive through an open place, or set crop.body by hand")
     elif len(coverage.box) and not coverage.can_crop:
         warnings.append(f"{100 * coverage.foreign_share:.0f} % of the points in the box around the "
                         "robot's own returns are not its own, so no crop.body and no sector hidden "
-                        "by it is set; set crop.body by hand with the report")
+                        "by it is set; set crop.body by hand")
     if m.pattern.second_returns > MAX_SECOND_RETURNS:
         warnings.append(f"{100 * m.pattern.second_returns:.0f} % of the points share their "
                         "direction with another, as second returns do; turn them off unless the "
