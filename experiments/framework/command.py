@@ -5,15 +5,16 @@ from __future__ import annotations
 import importlib
 import os
 import platform
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from lidar_perception import __version__
-from lidar_perception.cli.command import Choice, Command
+from lidar_perception.cli.command import Choice, Command, refuse_given
 from lidar_perception.cli.data import (
     WHAT,
     a_path,
@@ -21,14 +22,17 @@ from lidar_perception.cli.data import (
     limit_option,
     open_and_describe,
     out_folder,
-    split_option,
 )
+from lidar_perception.cli.options import Runs, Settings, checked, device_option, settings_options
+from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.machine import count_cores, read_cpu_name
 from lidar_perception.types import InputError
 
 if TYPE_CHECKING:
     from experiments.framework.experiment import Experiment
+    from experiments.framework.trained_models import ModelRequest
 
+SIM = "sim"
 EXPERIMENTS = {  # name -> module:attribute of an Experiment; the first is the default
     "stm-cpa": "experiments.stm_cpa.experiment:STM_CPA",
     "stm-cpa-configurations": "experiments.stm_cpa.configurations:CONFIGURATIONS",
@@ -36,19 +40,37 @@ EXPERIMENTS = {  # name -> module:attribute of an Experiment; the first is the d
 }
 
 
+def _list_parameters(given: Mapping[str, Any]) -> list[Runs]:
+    """Return the training parameters of the experiment that is named, for --set help."""
+    names = [word for word in given.get("words", ()) if word in EXPERIMENTS]
+    training = load_experiment(names[0]).training if names else None
+    return [] if training is None else [Runs(names[0], collect_fields(training), None)]
+
+
 @click.command(cls=Command)
-@click.argument("words", nargs=-1, metavar="[EXPERIMENT] DATA")
-@a_path("--data", f"Same as DATA. {WHAT}", "DATA")
-@split_option
+@click.argument("words", nargs=-1, metavar="[EXPERIMENT] DATA|sim")
+@a_path("--data", f"Same as DATA. {WHAT} `sim`: simulated scans, for experiments that train.",
+        "DATA|sim")
+@a_path("--split", "Measure only the frames or sequences named in this file, one per line. "
+        "Experiments that train use the others for training.")
 @out_folder("Folder for the report; the same command resumes a run that was stopped.",
             required=True)
+@click.option("--budget", type=click.FloatRange(0, min_open=True), metavar="HOURS",
+              help="Time for training and measuring, which sets the number of steps of all "
+              "networks. Default: 2 with `sim`, otherwise the paper's number of epochs.")
+@click.option("--seeds", type=click.IntRange(1, 20), metavar="N", help="Train every network with "
+              "this many seeds. Default: up to 3, as the budget allows.")
+@device_option
 @click.option("--jobs", type=click.IntRange(1), help="Number of processes. Default: one for each "
                                                      "core.")
 @dask_option
 @limit_option
-@click.option("--force", is_flag=True, help="Start over, whatever is in --out.")
+@click.option("--force", is_flag=True, help="Start over, whatever is in --out. Networks that were "
+              "trained there with the same settings are used again.")
+@settings_options(_list_parameters, "batch=8")
 def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out: Path,
-              jobs: int | None, dask: str | None, limit: int | None, force: bool) -> None:
+              budget: float | None, seeds: int | None, device: str, jobs: int | None,
+              dask: str | None, limit: int | None, force: bool, settings: Settings) -> None:
     """Run an experiment of a paper and report each value next to the paper's.
 
     EXPERIMENT is stm-cpa (default: every table of the STM-CPA paper), stm-cpa-configurations
@@ -56,8 +78,8 @@ def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out
     clustering and improved PointNet).
 
     FOLDER gets report.html, report.md, report.json, the tables as CSV and the figures as PNG, and
-    frames.jsonl with the record of every frame. Workers of --dask need this checkout in their
-    PYTHONPATH.
+    frames.jsonl with the record of every frame. Trained networks are in models/. Workers of --dask
+    need this checkout in their PYTHONPATH.
 
     \b
     Examples:
@@ -69,21 +91,33 @@ def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out
     if dask and jobs:
         raise click.UsageError("--jobs is for this machine, --dask for others: give one of them")
     from experiments.framework.report import group_skipped_frames, print_report, write_report
-    from experiments.framework.runner import run_experiment
+    from experiments.framework.runner import run_experiment, run_with_models
     from lidar_perception.data.frame import BOXES
     from lidar_perception.runs.terminal import console
 
     experiment = load_experiment(name)
-    recording = open_and_describe(data, split=split)
-    recording.require(BOXES, "reproduce")
     started, before = datetime.now().astimezone(), perf_counter()
     workers = jobs or count_cores()
-    records = run_experiment(experiment, recording, out, jobs=workers, dask=dask, force=force,
-                             limit=limit)
+    if experiment.training is None:
+        refuse_given(("budget", "seeds", "device", "config", "given"),
+                     f"is for experiments that train networks; {name} trains none")
+        recording = open_and_describe(data, split=split)
+        recording.require(BOXES, "reproduce")
+        records = run_experiment(experiment, recording, out, jobs=workers, dask=dask, force=force,
+                                 limit=limit)
+    else:
+        request = _make_request(experiment, data, split, out, budget, seeds, device, workers,
+                                limit, settings)
+        recording = request.scenes.open_test_recording(request.params, out / "scans")
+        experiment, records = run_with_models(experiment, request, recording, dask=dask,
+                                              force=force, limit=limit)
     seconds = perf_counter() - before
     sections = experiment.make_sections(records)
+    if experiment.illustrate is not None:
+        sections = [*sections, *experiment.illustrate(records, recording.frames)]
     about = {
-        "folder": str(data.resolve()) + (f", the first {limit} scans" if limit else ""),
+        "data": ("simulated scans" if str(data) == SIM else str(data.resolve()))
+        + (f", the first {limit} scans" if limit else ""),
         "started": started.isoformat(" ", "seconds"),
         "duration of this run": f"{seconds:.0f} s" + (
             f" on the cluster at {dask}" if dask else f", processes: {workers}"),
@@ -94,6 +128,29 @@ def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out
         raise InputError(f"{data}: no frame could be measured ({records[0]['skipped']})")
     print_report(sections, group_skipped_frames(records), console)
     console.print(f"report: {page}")
+
+
+def _make_request(experiment: Experiment, data: Path, split: Path | None, out: Path,
+                  budget: float | None, seeds: int | None, device: str, jobs: int,
+                  limit: int | None, settings: Settings) -> ModelRequest:
+    """Return the request for the models of an experiment.
+
+    Raises:
+        InputError: A parameter is unknown or wrong, or the frames cannot be split.
+    """
+    from experiments.framework.scenes import TEST_SCANS, ExperimentScenes
+    from experiments.framework.trained_models import DEFAULT_BUDGET_H, ModelRequest
+    assert experiment.training is not None and experiment.models is not None
+    scenes = ExperimentScenes.split(str(data), split)
+    given = settings.values(Runs(experiment.name, collect_fields(experiment.training), None))[0]
+    has_steps = any(given.get(name) for name in ("steps", "epochs"))
+    if scenes.is_simulated and not has_steps:
+        budget = budget or DEFAULT_BUDGET_H
+    protocol = experiment.protocol if budget is None and not has_steps else {}
+    params = checked(experiment.training, {**protocol, **given})
+    frames = TEST_SCANS if scenes.is_simulated else len(scenes.test)
+    return ModelRequest(experiment.models, params, scenes, out, budget, seeds, device, jobs,
+                        min(frames, limit or frames))
 
 
 def load_experiment(name: str) -> Experiment:
@@ -118,5 +175,5 @@ def _split_words(words: tuple[str, ...], data: Path | None) -> tuple[str, Path]:
         raise click.UsageError(f"DATA is given twice, {' '.join(rest)}"
                                + (f" and --data {data}" if data else "") + "; give one")
     if not rest and data is None:
-        raise click.UsageError("DATA is missing: give the path of a recording")
+        raise click.UsageError("DATA is missing: give the path of a recording, or `sim`")
     return name, data or Path(rest[0])

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
-from lidar_perception.data.frame import Frame
+if TYPE_CHECKING:
+    from experiments.framework.trained_models import Model, TrainedModel, Training
 
 
 @dataclass(frozen=True)
@@ -100,13 +102,31 @@ class Experiment:
         make_sections: make_sections(records) returns the report of the records of all frames, in
             their order. It is also called with the records of unfinished runs, and with none.
         settings: Everything that the records depend on. A run resumes only with equal settings.
+        training: Parameters of the detectors that the experiment trains; None: it trains none.
+            Otherwise measure() and make_sections() also get models=, the trained models by name.
+        protocol: Training parameters of the paper, by dotted name. They hold for recorded frames
+            without a budget.
+        models: models(params, seed) returns the detectors to train for a seed, in order of
+            importance.
+        illustrate: illustrate(records, frames) returns sections with pictures of frames. It gets
+            models= too.
 
-    Both functions belong to a module, so that worker processes can import them.
+    The functions belong to a module, so that worker processes can import them.
     """
 
     name: str
     title: str
     question: str
-    measure: Callable[[Sequence[Frame], int], dict[str, Any]]
-    make_sections: Callable[[list[dict[str, Any]]], list[Section]]
+    measure: Callable[..., dict[str, Any]]
+    make_sections: Callable[..., list[Section]]
     settings: dict[str, Any] = field(default_factory=dict)
+    training: Training | None = None
+    protocol: Mapping[str, Any] = field(default_factory=dict)
+    models: Callable[[Any, int], Sequence[Model]] | None = None
+    illustrate: Callable[..., list[Section]] | None = None
+
+    def with_models(self, models: Mapping[str, TrainedModel]) -> Experiment:
+        """Return the experiment whose functions get these models."""
+        return replace(self, measure=partial(self.measure, models=models),
+                       make_sections=partial(self.make_sections, models=models),
+                       illustrate=self.illustrate and partial(self.illustrate, models=models))

@@ -94,6 +94,38 @@ def compute_paired_p(counts: np.ndarray, compute: Callable[[np.ndarray], np.ndar
     return np.where(np.isnan(observed), np.nan, above / (params.replicates + 1))
 
 
+def estimate(draws: np.ndarray, level: float = BootstrapParams.level) -> np.ndarray:
+    """Return values with their intervals (3, *V), as bootstrap() does, of values computed already.
+
+    Args:
+        draws: (1 + R, *V): the values of all frames, then those of R samples of the frames. NaN
+            where there is no value.
+    """
+    if len(draws) == 1:
+        return np.stack([draws[0], *np.full((2, *draws[0].shape), np.nan)])
+    return np.stack([draws[0], *np.where(np.isnan(draws[0]), np.nan,
+                                         _compute_limits(draws[1:], level))])
+
+
+def compute_sampled_p(draws: np.ndarray) -> float:
+    """Return the two-sided p value of a difference, for the hypothesis that it is 0.
+
+    It is twice the share of the samples on the other side of 0, at least 2 / (R + 1).
+
+    Args:
+        draws: (1 + R,) differences, see estimate(). Both parts of a difference come from the same
+            frames.
+
+    Returns:
+        The p value; NaN without samples.
+    """
+    samples = draws[1:][~np.isnan(draws[1:])]
+    if len(samples) == 0 or np.isnan(draws[0]):
+        return np.nan
+    beyond = min((samples <= 0).sum(), (samples >= 0).sum())
+    return float(min(1.0, 2 * (beyond + 1) / (len(samples) + 1)))
+
+
 def _compute_limits(replicates: np.ndarray, level: float) -> np.ndarray:
     """Return the ends (2, *V) of the interval of replicates (R, *V); NaN where all are NaN."""
     empty = np.isnan(replicates).all(axis=0)

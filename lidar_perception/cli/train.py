@@ -118,11 +118,7 @@ def pointpillars(request: TrainingRequest, params: PointPillarsTraining) -> None
       torchrun --nproc-per-node 4 -m lidar_perception.cli.main train pointpillars sim \\
           --size full --budget 12 --out v4
     """
-    from lidar_perception.detectors.pointpillars.config import RANGES, make_config
-    from lidar_perception.training.pointpillars.trainer import PointPillarsTrainer
-    seen: dict[str, Any] = {**RANGES["around"]} if params.range == "around" else {}
-    config = make_config(params.version, params.size, **seen)  # default: ahead
-    run(PointPillarsTrainer(config), request, params)
+    run(request, params)
 
 
 @train.command()
@@ -143,10 +139,7 @@ def pointnet(request: TrainingRequest, params: PointNetTraining) -> None:
       lidar-perception train pointnet /data/kitti/object --split train.txt \\
           --val-split val.txt --epochs 20 --out pointnet --resume
     """
-    from lidar_perception.detectors.pointnet.config import make_pointnet_config
-    from lidar_perception.training.pointnet.trainer import PointNetTrainer, find_proposer
-    find_proposer(params)  # raises InputError before any work
-    run(PointNetTrainer(make_pointnet_config(params.network)), request, params)
+    run(request, params)
 
 
 @train.command()
@@ -184,10 +177,11 @@ def fused(weights: Path | None, classifier: Path | None, out: Path, force: bool,
     console.print(f"{out}: --weights of commands, and fused.weights of the node, take it")
 
 
-def run(trainer: Any, request: TrainingRequest, params: Any) -> None:
+def run(request: TrainingRequest, params: PointPillarsTraining | PointNetTraining) -> None:
     """Train, and print the result."""
     from lidar_perception.training.start import start_training
-    result = start_training(trainer, request, params, commit())
+    from lidar_perception.training.trainers import make_trainer
+    result = start_training(make_trainer(params), request, params, find_commit())
     if result is not None:
         print_result(*result, request.out)
 
@@ -234,7 +228,7 @@ def print_result(progress: Any, steps: int, batches: Any, out: Path) -> None:
         sys.exit(130)
 
 
-def commit() -> str:
+def find_commit() -> str:
     """Return the commit of this checkout, with + if files are changed, or else the version."""
     folder = Path(__file__).resolve().parents[2]
     try:

@@ -43,13 +43,19 @@ MIN_FREE_GB = 0.5  # on the disk
 
 @dataclass(frozen=True)
 class Planner:
-    """Plans the run of a request. params: parameters as requested, without a plan."""
+    """Plans the run of a request.
+
+    Attributes:
+        params: Parameters as requested, without a plan.
+        speed: Durations that were measured before; None: they are measured.
+    """
 
     trainer: Trainer
     request: TrainingRequest
     params: Any
     sensor: Sensor
     device: torch.device
+    speed: Speed | None = None
 
     def make_plan(self, settings: dict[str, Any]) -> PlannedRun:
         """Measure this machine, and return and report the plan that fits the budget.
@@ -58,11 +64,11 @@ class Planner:
             InputError: No scene can be used, the budget is too short, or the disk too small.
         """
         params = self.params
-        errors.print("measuring this machine with a few scenes ...")
-        speed, sources, held_out = self._measure_speed()
-        data = Data(has_simulated(sources), has_simulated(held_out), _count_recorded(sources),
-                    _count_recorded(held_out), params.batch * get_world_size(),
-                    self.trainer.max_cuts(params))
+        sources, held_out = self.open_few_scenes()
+        if (speed := self.speed) is None:
+            errors.print("measuring this machine with a few scenes ...")
+            speed = self.measure_speed(sources, held_out)
+        data = self.describe_scenes(sources, held_out)
         given = Plan(params.data.scans, params.data.val_scans, 0, params.steps,
                      params.validate_steps, bool(self.trainer.reduced_range(params)))
         plan = fit_plan(self.request.budget or DEFAULT_BUDGET_H, count_cores(), speed, data, given,
@@ -73,6 +79,12 @@ class Planner:
         _require_disk_space(Path(params.data.cache), params.data.cache_gb, plan, speed)
         self._print_plan(plan, speed, data, find_recorded_height(sources))
         return PlannedRun(settings, plan, speed, data)
+
+    def describe_scenes(self, sources: Sequence[Any], held_out: Sequence[Any]) -> Data:
+        """Return the numbers of the scenes of open_few_scenes()."""
+        return Data(has_simulated(sources), has_simulated(held_out), _count_recorded(sources),
+                    _count_recorded(held_out), self.params.batch * get_world_size(),
+                    self.trainer.max_cuts(self.params))
 
     def shorten_plan(self, run: PlannedRun, begun: float, hours: float) -> PlannedRun:
         """Return the plan with fewer steps if the preparation took longer than planned.
@@ -93,7 +105,7 @@ class Planner:
 
         if shorten_plan(plan, seconds_left(), slowdown, speed, data) == plan:
             return run
-        now = self._measure_speed()[0]
+        now = self.measure_speed(*self.open_few_scenes())
         step_slowdown = now.step / speed.step if plan.part else now.whole / speed.whole
         shortened = shorten_plan(plan, seconds_left(), max(1.0, step_slowdown), speed, data)
         if shortened != plan:
@@ -109,13 +121,16 @@ class Planner:
             "steps": plan.steps, "validate_steps": plan.validate_steps,
             "data.scans": plan.scans, "data.val_scans": plan.val_scans, **part})
 
-    def _measure_speed(self) -> tuple[Speed, Sequence[Any], Sequence[Any]]:
-        """Measure step durations on this machine; return them with the scene sources used."""
-        params = limit_to_few_scans(self.params)
-        sources, held_out = open_scenes(self.request, params, self.sensor)
+    def open_few_scenes(self) -> tuple[Sequence[Any], Sequence[Any]]:
+        """Return sources to train on and to validate on, with few simulated scans and no cache."""
+        return open_scenes(self.request, limit_to_few_scans(self.params), self.sensor)
+
+    def measure_speed(self, sources: Sequence[Any], held_out: Sequence[Any]) -> Speed:
+        """Measure this machine with the sources of open_few_scenes()."""
         scenes, scan, scan_mb = _time_scans((*sources, *held_out))
-        cut, step, whole, frame = self.trainer.measure_speed(params, scenes, held_out, self.device)
-        return Speed(scan, cut, step, whole, frame, scan_mb), sources, held_out
+        cut, step, whole, frame = self.trainer.measure_speed(
+            limit_to_few_scans(self.params), scenes, held_out, self.device)
+        return Speed(scan, cut, step, whole, frame, scan_mb)
 
     def _print_plan(self, plan: Plan, speed: Speed, data: Data, height: float | None) -> None:
         params = self.params

@@ -29,7 +29,7 @@ from lidar_perception.training.distributed import (
     wait_for_all,
 )
 from lidar_perception.training.loop import train
-from lidar_perception.training.plan import validation_duration
+from lidar_perception.training.plan import Speed, validation_duration
 from lidar_perception.training.planning import (
     DEFAULT_BUDGET_H,
     Planner,
@@ -56,7 +56,7 @@ class TrainingResult(NamedTuple):
 
 
 def start_training(trainer: Trainer, request: TrainingRequest, params: Any,
-                   commit: str = "") -> TrainingResult | None:
+                   commit: str = "", speed: Speed | None = None) -> TrainingResult | None:
     """Train a network, or resume a run.
 
     The first start measures this machine, makes a plan and keeps it in the run's folder; a resumed
@@ -67,6 +67,7 @@ def start_training(trainer: Trainer, request: TrainingRequest, params: Any,
         request: Data, output folder and limits.
         params: Parameters of the network's training.
         commit: Version of the code, written into the checkpoints.
+        speed: Durations for the plan, where they are known; None: this machine is measured.
 
     Returns:
         The end of the run; None in all but the first of several processes.
@@ -87,7 +88,7 @@ def start_training(trainer: Trainer, request: TrainingRequest, params: Any,
     chosen = torch.device(find_device(request.device))
     with join_process_group(chosen) as device, directory.lock():
         wait_for_all()  # until every process has looked at the files that rank 0 writes
-        planner = Planner(trainer, request, params, sensor, device)
+        planner = Planner(trainer, request, params, sensor, device, speed)
         if get_rank() == 0:
             make_folder(Path(params.data.cache))
             with _explain_interrupt():

@@ -1,0 +1,97 @@
+"""KITTI's average precision of several detectors on the same frames, with intervals.
+
+measure() of an experiment stores the objects of a frame with to_record(). The report reads them
+back and samples the frames (Efron, 1979), the same ones for all detectors, so that differences are
+paired.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.scoring.intervals import draw_samples, group_frames
+from lidar_perception.scoring.kitti.camera_objects import CameraObjects
+from lidar_perception.scoring.kitti.protocol import (
+    DIFFICULTIES,
+    RELAXED,
+    SCORED,
+    STRICT,
+    ComparedFrame,
+    Comparison,
+    compare_objects,
+    compute_precision,
+)
+
+CELLS = tuple((name, level) for name in SCORED for level in DIFFICULTIES)
+STRICT_3D, RELAXED_BEV = ("3d", STRICT), ("bev", RELAXED)
+PROTOCOLS = (STRICT_3D, RELAXED_BEV)  # metric, and overlap of a hit by class
+REPLICATES = 200
+NO_CAMERA = (-np.inf, -np.inf, np.inf, np.inf)
+COLUMNS = ("class_ids", "boxes", "truncated", "occluded", "scores", "regions")
+WIDTHS = {"boxes": 7, "regions": 4}
+
+
+def to_record(objects: CameraObjects) -> dict[str, Any]:
+    """Return objects as a dict that JSON can hold, without their observation angles."""
+    record = {name: np.round(getattr(objects, name), 4).tolist() for name in COLUMNS}
+    if np.isfinite(objects.image_boxes).all():
+        record["image_boxes"] = np.round(objects.image_boxes, 2).tolist()
+    return record
+
+
+def from_record(record: Mapping[str, Any]) -> CameraObjects:
+    """Return the objects of a record; their observation angles are NaN."""
+    count = len(record["class_ids"])
+    columns = {name: np.array(record[name], float).reshape(-1, WIDTHS[name]) if name in WIDTHS
+               else np.array(record[name], float) for name in COLUMNS}
+    pixels = record.get("image_boxes")
+    return CameraObjects(
+        columns["class_ids"].astype(np.int32), columns["boxes"],
+        np.tile(NO_CAMERA, (count, 1)) if pixels is None
+        else np.array(pixels, float).reshape(-1, 4),
+        np.full(count, np.nan), columns["truncated"], columns["occluded"].astype(int),
+        columns["scores"], columns["regions"])
+
+
+def compare_records(true: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]]
+                    ) -> list[ComparedFrame]:
+    """Return the comparison of the records of labels and of detections of the same frames."""
+    return [compare_objects(from_record(t), from_record(f)) for t, f in zip(true, found)]
+
+
+def compute_cells(frames: list[ComparedFrame]) -> np.ndarray:
+    """Return the average precision (R40, percent) by PROTOCOLS and CELLS, then its mean, (2, 10).
+
+    NaN without counted labels.
+    """
+    cells = np.full((len(PROTOCOLS), len(CELLS) + 1), np.nan)
+    if not frames:
+        return cells
+    compared = Comparison.of(frames)
+    for i, (metric, overlaps) in enumerate(PROTOCOLS):
+        for j, (name, level) in enumerate(CELLS):
+            found = compute_precision(compared, name, metric, overlaps[name], level)
+            cells[i, j] = np.nan if found is None else found.r40
+        if not np.isnan(cells[i]).all():
+            cells[i, -1] = np.nanmean(cells[i])
+    return cells
+
+
+def draw_cells(names: Sequence[str], detectors: Mapping[str, list[ComparedFrame]],
+               replicates: int = REPLICATES) -> dict[str, np.ndarray]:
+    """Return the cells of each detector for all frames and for samples of them.
+
+    Args:
+        names: Names of the frames; frames of one drive are drawn together.
+        detectors: The compared frames of each detector, in the order of the names.
+
+    Returns:
+        Name of a detector -> (1 + R, 2, 10), see compute_cells() and statistics.estimate(). R is 0
+        for frames that cannot be divided.
+    """
+    samples = [np.arange(len(names)), *draw_samples(group_frames(names), replicates)]
+    return {name: np.stack([compute_cells([frames[i] for i in sample]) for sample in samples])
+            for name, frames in detectors.items()}

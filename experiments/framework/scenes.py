@@ -1,0 +1,172 @@
+"""Scenes of an experiment: to train on, to validate on, and to measure on, which share none.
+
+The scenes are simulated, or the frames of a labelled recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+
+from lidar_perception.data.frame import BOXES, CAMERA, Frame, Recording
+from lidar_perception.data.open import open_recording
+from lidar_perception.runs.files import write_text
+from lidar_perception.runs.resuming import hash_names
+from lidar_perception.simulation.scene import Scenes
+from lidar_perception.simulation.sensor import find_sensor
+from lidar_perception.training.frames import LabelledFrames, open_labelled_frames
+from lidar_perception.training.params import PAPER_SHARE
+from lidar_perception.training.scenes import SimulatedScenes
+from lidar_perception.training.sources import SIM
+
+FIRST_TEST_SCENE = 40_000_000  # no training uses scenes near it
+TEST_SCANS = 120
+SPLIT_SEED = 0
+
+
+@dataclass(frozen=True)
+class ExperimentScenes:
+    """The scenes of an experiment.
+
+    Attributes:
+        data: Path of a recording, or "sim".
+        train, val, test: Names of the frames; empty for simulated scenes.
+        height: Height of the sensor above the ground in metres; None: as the recording says.
+    """
+
+    data: str
+    train: tuple[str, ...] = ()
+    val: tuple[str, ...] = ()
+    test: tuple[str, ...] = ()
+    height: float | None = None
+
+    @staticmethod
+    def split(data: str, test: Path | None = None) -> ExperimentScenes:
+        """Split the frames of a recording.
+
+        Args:
+            data: Path of a recording, or "sim".
+            test: File that names the frames to measure on; None: as large a share as is validated
+                on. KITTI's own test frames have no public labels.
+
+        Raises:
+            InputError: There are fewer than three labelled frames, or a name is unknown.
+        """
+        if data == SIM:
+            return ExperimentScenes(SIM)
+        path = Path(data)
+        frames = open_labelled_frames(path)
+        if test is None:
+            rest, measured = frames.split(PAPER_SHARE, SPLIT_SEED)
+        else:
+            measured = open_labelled_frames(path, test)
+            rest = frames.exclude([measured], "train on")
+        train, val = rest.split(PAPER_SHARE * len(frames.frames) / len(rest.frames), SPLIT_SEED)
+        return ExperimentScenes(data, _list_names(train), _list_names(val), _list_names(measured),
+                                frames.height)
+
+    @property
+    def is_simulated(self) -> bool:
+        return self.data == SIM
+
+    def settings(self) -> dict[str, Any]:
+        """Return what identifies these scenes, for the settings of a run."""
+        return {"data": self.data if self.is_simulated else str(Path(self.data).resolve()),
+                **{name: hash_names(getattr(self, name)) for name in ("train", "val", "test")}}
+
+    def select_labelled(self, share: float) -> tuple[str, ...]:
+        """Return a share of the frames to train on. Smaller shares are part of larger ones."""
+        order = np.random.default_rng(SPLIT_SEED).permutation(len(self.train))
+        count = max(1, round(share * len(self.train)))
+        return tuple(self.train[i] for i in np.sort(order[:count]))
+
+    def write_splits(self, folder: Path, share: float) -> tuple[Path, Path] | tuple[None, None]:
+        """Write files that name a share of the frames to train on, and those to validate on.
+
+        Returns the files; None for simulated scenes.
+        """
+        if self.is_simulated:
+            return None, None
+        files = folder / f"train-{100 * share:g}.txt", folder / "val.txt"
+        for file, names in zip(files, (self.select_labelled(share), self.val)):
+            write_text(file, "\n".join(names))
+        return files
+
+    def open_test_recording(self, params: Any, cache: Path, count: int = TEST_SCANS) -> Recording:
+        """Open the frames to measure on.
+
+        Args:
+            params: Training parameters, whose sensor and scenes are simulated.
+            cache: Folder of simulated scans.
+            count: Number of simulated scans, each of another scene.
+        """
+        if self.is_simulated:
+            return open_simulated(params, cache, count)
+        return open_selected(Path(self.data), self.test, self.height)
+
+    def describe(self, params: Any) -> str:
+        """Return one sentence about the scenes to train on, to validate on and to measure on."""
+        if self.is_simulated:
+            return (f"{params.data.scans} simulated {params.scene} scans of {params.sensor} to "
+                    f"train on, {params.data.val_scans} of other scenes to validate on, and others "
+                    "again to measure on")
+        return (f"{len(self.train)} frames to train on, {len(self.val)} to validate on and "
+                f"{len(self.test)} to measure on, all of {self.data}")
+
+
+def _list_names(frames: LabelledFrames) -> tuple[str, ...]:
+    return tuple(frame.name for frame in frames.frames)
+
+
+def open_selected(path: Path, names: Sequence[str], height: float | None) -> Recording:
+    """Open the frames of a recording that have these names."""
+    recording = open_recording(path, sensor_height=height)
+    frames = {frame.name: frame for frame in recording.frames[:]}
+    return replace(recording, frames=[frames[name] for name in names], missing_scans=(),
+                   reopen=partial(open_selected, path, names, height))
+
+
+def open_simulated(params: Any, folder: Path, count: int) -> Recording:
+    """Return simulated scans to measure on as a recording; each is computed once and kept."""
+    scenes = Scenes(None, params.data.val_people, params.scene)
+    source = SimulatedScenes(
+        FIRST_TEST_SCENE, count, find_sensor(params.sensor, params.mount_height), scenes,
+        folder, params.data.cache_gb, around=getattr(params, "range", "") == "around")
+    has = frozenset({BOXES, CAMERA} if scenes.camera else {BOXES})
+    return Recording(Path(SIM), f"simulated {params.scene}", TestFrames(source), has,
+                     reopen=partial(open_simulated, params, folder, count), is_sequential=False)
+
+
+class TestFrames(Sequence[Frame]):
+    """Simulated frames, each of which is computed when its content is read."""
+
+    __test__ = False  # for pytest
+
+    def __init__(self, source: SimulatedScenes) -> None:
+        self.source = source
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Frame]: ...
+
+    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        number = range(len(self))[index]
+        read = cache(partial(self.source.frame, number))
+        scene, _ = self.source.locate(number)
+        return Frame(f"scene {scene}", 0, lambda: read().load(), lambda: read().truth(),
+                     calibration=lambda: read().calibration(),
+                     sensor_height=self.source.sensor.height)
+
+

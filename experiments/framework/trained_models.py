@@ -1,0 +1,271 @@
+"""Detectors that an experiment trains: on the same scenes, within one budget, each only once.
+
+    plan = plan_training(models, request)           # measured once, then read from a file
+    trained = train_models(models, request, plan)   # a finished model is not trained again
+
+Every model has a folder out/models/NAME-HASH, where the hash is that of its configuration. A run
+that was stopped resumes there.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from experiments.framework.scenes import TEST_SCANS, ExperimentScenes
+from lidar_perception import __version__
+from lidar_perception.param_fields import with_values
+from lidar_perception.runs.files import read_text, write_text
+from lidar_perception.runs.terminal import errors, format_duration
+from lidar_perception.training.params import PointNetTraining, PointPillarsTraining
+from lidar_perception.training.plan import Plan, Speed, fit_plan, training_durations
+from lidar_perception.training.request import TrainingRequest
+
+Training = PointPillarsTraining | PointNetTraining
+DEFAULT_BUDGET_H = 2.0  # with simulated scans
+MAX_SEEDS = 3
+STEPS_PER_SEED = 4000   # from this many steps of each model on, another seed is worth more
+NORM_STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
+
+
+@dataclass(frozen=True)
+class Model:
+    """A detector to train.
+
+    Attributes:
+        name: Unique name in the experiment, such as "v4, seed 1".
+        params: Its training. The numbers of scenes and steps come from the common plan.
+        label_share: Share of the labelled scenes that it is trained on, above 0 to 1.
+        required: Train it even where the budget is spent.
+    """
+
+    name: str
+    params: Training
+    label_share: float = 1.0
+    required: bool = True
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """A trained detector.
+
+    Attributes:
+        weights: The checkpoint with the best validation score.
+        steps, seconds: Length of its training.
+        best_step: Step of the checkpoint.
+        scenes: Number of scenes that it was trained on.
+        parameters: Number of parameters that were learnt.
+    """
+
+    model: Model
+    weights: Path
+    steps: int
+    seconds: float
+    best_step: int
+    scenes: int
+    parameters: int
+
+
+@dataclass(frozen=True)
+class ModelRequest:
+    """What to train and where.
+
+    Attributes:
+        models: models(params, seed) returns the models of a seed, in order of importance.
+        params: Training parameters that all models share, as far as the user gave any.
+        scenes: The scenes.
+        out: Folder of the experiment.
+        budget: Hours for everything; None: no limit, the parameters give the number of steps.
+        seeds: Number of seeds; None: as many, up to MAX_SEEDS, as leave each STEPS_PER_SEED steps.
+        test_frames: Number of frames that are measured afterwards.
+    """
+
+    models: Callable[[Any, int], Sequence[Model]]
+    params: Training
+    scenes: ExperimentScenes
+    out: Path
+    budget: float | None = None
+    seeds: int | None = None
+    device: str = "auto"
+    jobs: int = 1
+    test_frames: int = TEST_SCANS
+
+    @property
+    def folder(self) -> Path:
+        """Folder of all trained models."""
+        return self.out / "models"
+
+    def settings(self) -> dict[str, Any]:
+        """Return everything that the trained models depend on, apart from this machine's speed."""
+        return {"params": self.params.fixed_settings(), "scenes": self.scenes.settings(),
+                "budget": self.budget, "seeds": self.seeds, "version": __version__}
+
+    def to_training(self, model: Model, folder: Path) -> TrainingRequest:
+        """Return the request for the training of one model."""
+        split, val_split = self.scenes.write_splits(self.folder, model.label_share)
+        return TrainingRequest((self.scenes.data,), (), split, val_split, folder, True, None,
+                               self.device, self.jobs if self.jobs > 1 else 0)
+
+
+@dataclass(frozen=True)
+class SharedPlan:
+    """Numbers that all models have in common.
+
+    Attributes:
+        values: Training parameters by dotted name.
+        seeds: Number of seeds.
+        durations: Expected seconds of the training of each model, by name.
+        speeds: Measured durations of each model, by name.
+    """
+
+    values: dict[str, Any]
+    seeds: int
+    durations: dict[str, float]
+    speeds: dict[str, Speed] = field(default_factory=dict)
+
+    def apply(self, model: Model) -> Model:
+        """Return the model with the numbers of the plan."""
+        scans = self.values["data.scans"]  # 0 without simulated ones
+        return replace(model, params=with_values(model.params, {
+            **self.values, "data.scans": max(min(scans, 1), round(model.label_share * scans))}))
+
+
+def plan_training(request: ModelRequest) -> SharedPlan:
+    """Return the plan of an experiment, which is measured once and then read from a file.
+
+    Raises:
+        InputError: The budget is too short, or no scene can be used.
+    """
+    file = request.folder / f"plan-{_hash(request.settings())}.json"
+    if file.exists():
+        content = json.loads(read_text(file))
+        speeds = {name: Speed(**speed) for name, speed in content.pop("speeds").items()}
+        return SharedPlan(**content, speeds=speeds)
+    plan = _make_plan(request)
+    write_text(file, json.dumps(asdict(plan), indent=1))
+    return plan
+
+
+def _make_plan(request: ModelRequest) -> SharedPlan:
+    import torch
+
+    from lidar_perception.detectors.devices import find_device
+    from lidar_perception.simulation.sensor import find_sensor
+    from lidar_perception.training.planning import Planner
+    from lidar_perception.training.trainers import make_trainer
+
+    params, device = request.params, torch.device(find_device(request.device))
+    errors.print("measuring this machine with a few scenes of each network ...")
+    models = request.models(params, 0)
+    known: dict[Any, Speed] = {}
+    reduced: dict[str, Any] = {}
+    data = None
+    for model in models:
+        key = replace(model.params, seed=0)
+        if key not in known:
+            trainer = make_trainer(model.params)
+            planner = Planner(trainer, request.to_training(model, request.folder), model.params,
+                              find_sensor(model.params.sensor, model.params.mount_height), device)
+            sources = planner.open_few_scenes()
+            known[key] = planner.measure_speed(*sources)
+            if model.label_share == 1.0 and data is None:
+                data, reduced = planner.describe_scenes(*sources), trainer.reduced_range(params)
+    assert data is not None, "an experiment needs a model with all labels"
+    speeds = {model.name: known[replace(model.params, seed=0)] for model in models}
+    given = Plan(params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps,
+                 bool(reduced))
+    measuring = request.test_frames * sum(s.frame for s in speeds.values()) / request.jobs
+
+    def fit(seeds: int) -> Plan:
+        hours = request.budget or DEFAULT_BUDGET_H
+        return fit_plan(max(0.1 * hours, hours - seeds * measuring / 3600), request.jobs,
+                        _add_speeds(list(speeds.values()) * seeds), data, given, params.epochs)
+
+    plan = fit(request.seeds or 1)
+    seeds = request.seeds or min(max(plan.steps // STEPS_PER_SEED, 1), MAX_SEEDS)
+    if seeds > (request.seeds or 1):
+        plan = fit(seeds)
+    if params.validate_epochs and not params.validate_steps:
+        epoch = max(1, round((plan.scans + data.recorded) / data.batch))
+        plan = replace(plan, validate_steps=params.validation_steps(epoch))
+    values = {"steps": plan.steps, "validate_steps": plan.validate_steps, "data.scans": plan.scans,
+              "data.val_scans": plan.val_scans, **(reduced if plan.part else {})}
+    durations = {name: sum(training_durations(plan, speed, data)) for name, speed in speeds.items()}
+    errors.print(f"{seeds} x {len(models)} networks of {plan.steps} steps: about "
+                 + format_duration(seeds * sum(durations.values())))
+    return SharedPlan(values, seeds, durations, speeds)
+
+
+def _add_speeds(speeds: Sequence[Speed]) -> Speed:
+    """Return the speed of a training of several networks at once, on the same scans."""
+    return Speed(speeds[0].scan, max(s.cut for s in speeds), sum(s.step for s in speeds),
+                 sum(s.whole for s in speeds), sum(s.frame for s in speeds), speeds[0].scan_mb)
+
+
+def train_models(request: ModelRequest, plan: SharedPlan) -> dict[str, TrainedModel]:
+    """Train all models, or as many as fit into the budget, and return them by name.
+
+    Raises:
+        KeyboardInterrupt: The run was stopped; it resumes with the same request.
+        InputError: A network cannot be trained.
+    """
+    limit = math.inf if request.budget is None else 3600 * request.budget
+    trained: dict[str, TrainedModel] = {}
+    for seed in range(plan.seeds):
+        for first, model in zip(request.models(request.params, 0),
+                                request.models(request.params, seed)):
+            planned = plan.apply(model)
+            folder = request.folder / _name_folder(planned, request.scenes)
+            if not (folder / "last.safetensors").exists():
+                spent = sum(done.seconds for done in trained.values())
+                optional = seed > 0 or not model.required
+                if optional and spent + plan.durations[first.name] > limit:
+                    errors.print(f"{model.name} is left out, as the budget is spent")
+                    continue
+                errors.print(f"training {model.name}", style="bold")
+                _train(planned, request, folder, plan.speeds[first.name])
+            trained[model.name] = read_trained(planned, folder)
+    return trained
+
+
+def _train(model: Model, request: ModelRequest, folder: Path, speed: Speed) -> None:
+    from lidar_perception.cli.train import find_commit
+    from lidar_perception.training.start import start_training
+    from lidar_perception.training.trainers import make_trainer
+    params = with_values(model.params, {"data.cache": str(request.out / "scans")})
+    result = start_training(make_trainer(params), request.to_training(model, folder), params,
+                            find_commit(), speed)
+    if result is not None and result.progress.stopped:
+        errors.print("stopped; the same command resumes")
+        raise KeyboardInterrupt
+
+
+def read_trained(model: Model, folder: Path) -> TrainedModel:
+    """Read a finished training."""
+    from safetensors import safe_open
+
+    from lidar_perception.detectors.checkpoint import read_header
+    best, last = folder / "best.safetensors", folder / "last.safetensors"
+    record = read_header(last).training
+    with safe_open(best, "np") as tensors:
+        count = sum(math.prod(tensors.get_slice(name).get_shape()) for name in tensors.keys()
+                    if not name.endswith(NORM_STATISTICS))
+    return TrainedModel(model, best, record["steps"], record["seconds"],
+                        read_header(best).training["steps"], record["scenes"], count)
+
+
+def _name_folder(model: Model, scenes: ExperimentScenes) -> str:
+    """Return the name of a model's folder, which depends on everything that it is trained with."""
+    chosen = {"params": model.params.fixed_settings(), "scenes": scenes.settings(),
+              "labelled": model.label_share, "version": __version__}
+    return f"{re.sub(r'[^a-z0-9]+', '-', model.name.lower()).strip('-')}-{_hash(chosen)}"
+
+
+def _hash(settings: dict[str, Any]) -> str:
+    return sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
