@@ -11,7 +11,7 @@ from lidar_perception.candidates.seeds import find_clicked_cluster
 from lidar_perception.classes import DETECTED, Size
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.geometry import points_in_box, to_box_frame, wrap_angle
-from lidar_perception.ground.surface import fit_ground_heights
+from lidar_perception.ground.surface import fit_ground_surface
 from lidar_perception.types import InputError
 from lidar_studio.drive import Scan
 
@@ -70,16 +70,12 @@ def snap_to_ground(scan: Scan, box: Array) -> Array:
 
 
 def _find_ground_height(scan: Scan, box: Array) -> float:
-    """Return the z of the ground below a box (7,), else of the nearest ground points, else NaN."""
+    """Return the z of the ground below a box (7,), NaN without ground points around it."""
     ground = scan.xyz[scan.ground]
-    floor = float(fit_ground_heights(ground, box[None, :2])[0])
-    if np.isfinite(floor) or len(ground) < MIN_GROUND_POINTS:
-        return floor
-    distances = np.hypot(*(ground[:, :2] - box[:2]).T)
-    nearest = np.argpartition(distances, MIN_GROUND_POINTS - 1)[:MIN_GROUND_POINTS]
-    if distances[nearest].max() > MAX_GROUND_DISTANCE_M:
+    near = ground[np.hypot(*(ground[:, :2] - box[:2]).T) < MAX_GROUND_DISTANCE_M]
+    if len(near) < MIN_GROUND_POINTS:
         return np.nan
-    return float(np.median(ground[nearest, 2]))
+    return float(fit_ground_surface(near, float(np.median(near[:, 2]))).at(box[None])[0])
 
 
 def resize_box(box: Array, size: Array) -> Array:

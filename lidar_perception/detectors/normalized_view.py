@@ -10,6 +10,7 @@ from lidar_perception.classes import CAR
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.ground.params import GroundParams, SensorPoseParams
 from lidar_perception.ground.segment import level_points, segment_ground
+from lidar_perception.ground.surface import GroundSurface
 from lidar_perception.intensity import MIN_POINTS, normalize_intensity
 from lidar_perception.types import SENSOR_HEIGHT, Detections, PointCloud
 
@@ -64,9 +65,30 @@ class NormalizedView:
     def __len__(self) -> int:
         return len(self.frame)
 
+    def crop(self, low: Corner, high: Corner) -> NormalizedView:
+        """Return the points of the view with low <= x y z < high."""
+        kept, frame = crop_to_range(self.frame, low, high)
+        return replace(self, frame=frame, indices=self.indices[kept])
+
+    def flatten(self, surface: GroundSurface) -> NormalizedView:
+        """Return the view with every point moved vertically, so that the surface of the ground is
+        SENSOR_HEIGHT below the sensor everywhere."""
+        xyz = self.frame.xyz.copy()
+        xyz[:, 2] -= surface.at(xyz) + SENSOR_HEIGHT
+        return replace(self, frame=replace(self.frame, xyz=xyz))
+
     def take(self, column: np.ndarray | None) -> np.ndarray | None:
         """Return the values (M,) of a column (N,) of the source; None for None."""
         return None if column is None else column.take(self.indices)
+
+    def convert(self, column: np.ndarray | None, other: NormalizedView) -> np.ndarray | None:
+        """Return the values (M,) of a column of this view for the K points of another view of the
+        same source: (K,), 0 for points that are not in this view; None for None."""
+        if column is None:
+            return None
+        values = np.zeros(len(self.source), column.dtype)
+        values[self.indices] = column
+        return values.take(other.indices)
 
     def intensity_problem(self) -> str | None:
         """Return the problem if the cloud has no usable intensity; None if it has, or the view

@@ -1,64 +1,85 @@
-"""Height of the ground at a place, from a plane through the ground points around it."""
+"""A smooth surface through the ground points of a cloud."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from scipy import ndimage
 
-RADIUS_M = 3.0          # around a place
-MIN_POINTS = 8          # ground points within the radius
-MAX_GRADIENT = 0.3      # steeper planes come from points along a line
-MIN_VARIANCE_M2 = 0.15  # smallest variance of the points along either principal axis in x-y
+CELL_M = 2.0       # width of the square cells whose mean heights the surface goes through
+MIN_POINTS = 3     # ground points in a cell that has a height
+SMOOTHING_M = 2.4  # standard deviation of the Gaussian that smooths the heights
+MIN_WEIGHT = 1e-3  # of a smoothed height; cells with less get the height of the nearest cell
 
 
-def fit_ground_heights(ground: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Fit the height of the ground at places xy (K, 2) to ground points (G, 3), in metres.
+class GroundSurface(NamedTuple):
+    """Heights of the ground on a grid, linear between the centres of its cells and constant beyond.
 
-    Time grows with K * G: meant for detections, not for all points of a cloud.
-
-    Returns:
-        (K,) float64 z of the plane through the ground points within RADIUS_M, or their mean z if
-        they are on a line; NaN for fewer than MIN_POINTS.
+    Attributes:
+        heights: (I, J) float64 z at the centres of the cells, in metres.
+        first: x and y of the centre of cell (0, 0), in metres.
     """
-    return _fit_ground_heights(np.ascontiguousarray(ground, np.float32).reshape(-1, 3),
-                               np.ascontiguousarray(xy, np.float64).reshape(-1, 2))
+
+    heights: np.ndarray
+    first: tuple[float, float]
+
+    def at(self, xy: np.ndarray) -> np.ndarray:
+        """Return the height (K,) float64 of the ground at places (K, 2 or more) [x y ...]."""
+        return _interpolate(self.heights, np.asarray(xy), *self.first)
+
+
+def fit_ground_surface(ground: np.ndarray, default: float) -> GroundSurface:
+    """Fit a surface to ground points (G, 3).
+
+    The mean heights of cells are smoothed. Where there is no ground, under cars for example, the
+    surface continues that of the cells around, or else of the nearest cell.
+
+    Args:
+        ground: finite points of a limited area, as memory grows with the area.
+        default: height in metres if no cell has MIN_POINTS points.
+    """
+    if not len(ground):
+        return GroundSurface(np.full((1, 1), default), (0.0, 0.0))
+    low = np.floor(ground[:, :2].min(axis=0) / CELL_M)
+    shape = (np.floor(ground[:, :2].max(axis=0) / CELL_M) - low).astype(np.int64) + 1
+    total, count = _sum_cells(ground, low, shape)
+    has_height = count >= MIN_POINTS
+    if not has_height.any():
+        return GroundSurface(np.full((1, 1), default), (0.0, 0.0))
+    mean = np.divide(total, count, out=np.zeros(shape), where=has_height)
+    sigma = SMOOTHING_M / CELL_M
+    weight = ndimage.gaussian_filter(has_height.astype(np.float64), sigma, mode="constant")
+    smooth = ndimage.gaussian_filter(mean, sigma, mode="constant") / np.maximum(weight, MIN_WEIGHT)
+    nearest = ndimage.distance_transform_edt(weight < MIN_WEIGHT, return_distances=False,
+                                             return_indices=True)
+    x, y = (low + 0.5) * CELL_M
+    return GroundSurface(smooth[tuple(nearest)], (float(x), float(y)))
 
 
 @njit(cache=True, nogil=True)
-def _fit_ground_heights(ground, xy):
-    heights = np.full(len(xy), np.nan)
+def _sum_cells(ground, low, shape):
+    """Return, by cell, the sum of the heights and the number of ground points."""
+    total, count = np.zeros((shape[0], shape[1])), np.zeros((shape[0], shape[1]))
+    for k in range(len(ground)):
+        i = int(np.floor(ground[k, 0] / CELL_M) - low[0])
+        j = int(np.floor(ground[k, 1] / CELL_M) - low[1])
+        total[i, j] += ground[k, 2]
+        count[i, j] += 1.0
+    return total, count
+
+
+@njit(cache=True, nogil=True)
+def _interpolate(heights, xy, first_x, first_y):
+    result = np.empty(len(xy))
+    last_i, last_j = heights.shape[0] - 1, heights.shape[1] - 1
     for k in range(len(xy)):
-        x, y = xy[k]
-        n = sx = sy = sz = xx = yy = cross = xz = yz = 0.0
-        for i in range(len(ground)):
-            u = ground[i, 0] - x
-            if u > RADIUS_M or u < -RADIUS_M:
-                continue
-            v = ground[i, 1] - y
-            if u * u + v * v > RADIUS_M * RADIUS_M:
-                continue
-            z = np.float64(ground[i, 2])
-            n += 1.0
-            sx += u
-            sy += v
-            sz += z
-            xx += u * u
-            yy += v * v
-            cross += u * v
-            xz += u * z
-            yz += v * z
-        if n < MIN_POINTS:
-            continue
-        mx, my, mz = sx / n, sy / n, sz / n
-        heights[k] = mz
-        vxx, vyy, vxy = xx / n - mx * mx, yy / n - my * my, cross / n - mx * my
-        least = (vxx + vyy) / 2 - np.sqrt((vxx - vyy) ** 2 / 4 + vxy * vxy)
-        if least < MIN_VARIANCE_M2:
-            continue
-        determinant = vxx * vyy - vxy * vxy
-        vxz, vyz = xz / n - mx * mz, yz / n - my * mz
-        a = (vxz * vyy - vyz * vxy) / determinant
-        b = (vyz * vxx - vxz * vxy) / determinant
-        if a * a + b * b <= MAX_GRADIENT * MAX_GRADIENT:
-            heights[k] = mz - a * mx - b * my
-    return heights
+        u = min(max((xy[k, 0] - first_x) / CELL_M, 0.0), float(last_i))
+        v = min(max((xy[k, 1] - first_y) / CELL_M, 0.0), float(last_j))
+        i, j = min(int(u), max(last_i - 1, 0)), min(int(v), max(last_j - 1, 0))
+        u, v = u - i, v - j
+        next_i, next_j = min(i + 1, last_i), min(j + 1, last_j)
+        result[k] = ((1 - u) * ((1 - v) * heights[i, j] + v * heights[i, next_j])
+                     + u * ((1 - v) * heights[next_i, j] + v * heights[next_i, next_j]))
+    return result

@@ -34,13 +34,25 @@ from lidar_perception.detectors.fused.evidence import MIN_PROBABILITY, to_log_od
 from lidar_perception.detectors.fused.fusion import KNOTS, load_shipped_models
 from lidar_perception.detectors.fused.model import compute_max_probabilities, compute_probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
-from lidar_perception.detectors.normalized_view import drop_ego_vehicle
+from lidar_perception.detectors.normalized_view import (
+    NormalizedView,
+    drop_ego_vehicle,
+    segment_view_ground,
+)
 from lidar_perception.detectors.pointnet import classifier
 from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
 from lidar_perception.detectors.trained_network import Placement
-from lidar_perception.geometry import bev_iou, points_in_box, points_in_boxes, wrap_angle
-from lidar_perception.ground.surface import MIN_POINTS, fit_ground_heights
+from lidar_perception.geometry import (
+    bev_iou,
+    centre_distances,
+    points_in_box,
+    points_in_boxes,
+    wrap_angle,
+)
 from lidar_perception.param_fields import with_values
+from lidar_perception.simulation.scene import Scenes
+from lidar_perception.simulation.sensor import find_sensor
+from lidar_perception.training.scenes import SimulatedScenes
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, PointCloud
 
 # Others run these lines.
@@ -66,24 +78,6 @@ def test_points_in_boxes_equals_points_in_box(seed, count, boxes, margin):
     for k, box in enumerate(boxes):
         np.testing.assert_array_equal(indices[first[k]:first[k + 1]],
                                       np.flatnonzero(points_in_box(xyz, box, margin)))
-
-
-@given(SEEDS, st.floats(-0.25, 0.25), st.floats(-0.1, 0.1))
-def test_fit_ground_heights_on_a_slope(seed, along, across):
-    rng = np.random.default_rng(seed)
-    xy = rng.uniform(-20, 20, (12000, 2))
-    ground = np.column_stack([xy, xy @ [along, across] - 1.7])
-    places = rng.uniform(-15, 15, (10, 2))
-    heights = fit_ground_heights(ground, places)
-    np.testing.assert_allclose(heights, places @ [along, across] - 1.7, atol=1e-4)
-    # The order of points and distant points have no effect; without ground the result is NaN.
-    np.testing.assert_allclose(fit_ground_heights(ground[::-1], places), heights, atol=1e-9)
-    far = np.concatenate([ground, ground + [200, 0, 9]])
-    np.testing.assert_allclose(fit_ground_heights(far, places), heights, atol=1e-9)
-    assert np.isnan(fit_ground_heights(ground, places + 500)).all()
-    assert np.isnan(fit_ground_heights(ground[:MIN_POINTS - 1], places)).all()
-    line = np.column_stack([np.linspace(-2, 2, 50), np.zeros(50), np.linspace(0, 9, 50)])
-    assert fit_ground_heights(line, np.array([[0, 1.0]])) == pytest.approx(line[:, 2].mean())
 
 
 def shell(box: np.ndarray, rng, count: int = 400) -> np.ndarray:
@@ -241,10 +235,13 @@ def test_sensor_height_and_given_columns_change_nothing(detector):
     assert len(below) > 90
     np.testing.assert_allclose(above.boxes, below.boxes, atol=2e-3)
     np.testing.assert_allclose(above.scores, below.scores, atol=2e-3)
-    proposals = detector.propose(scan)
     # Points outside the range do not need a ground label.
-    ground = ~np.isin(scan.xyz.view("V12").ravel(), proposals.obstacles.view("V12").ravel())
+    config = detector.proposer.config
+    view = NormalizedView.of(scan, low=config.low, high=config.high)
+    ground = np.zeros(len(scan), bool)
+    ground[view.indices] = segment_view_ground(view.frame, detector.params.ground)
     assert same(detector(scan, ground=ground), found)
+    assert same(detector(scan, ground=ground | ~np.isin(np.arange(len(scan)), view.indices)), found)
 
 
 def test_ignored_intensity_equals_missing_intensity(detector):
@@ -257,7 +254,8 @@ def test_ignored_intensity_equals_missing_intensity(detector):
     without = replace(scan, intensity=None)
     assert "no intensity" in detector(without).problem and other(without).problem is None
     assert same(other(scan), other(without)) and other(scan).problem is None
-    assert len(other.propose(scan).ground) == len(detector.propose(scan).ground)
+    surfaces = [one.propose(scan).surface.heights for one in (other, detector)]
+    np.testing.assert_array_equal(*surfaces)
 
 
 def test_max_proposals_keeps_the_best_boxes(detector):
@@ -279,6 +277,25 @@ def test_classifier_box_interpolates_between_networks(detector):
     assert asked.any() and not asked.all()
     np.testing.assert_array_equal((own != judged).any(axis=1), asked)
     np.testing.assert_allclose(half[:, :6], (own + judged)[:, :6] / 2, atol=1e-4)
+
+
+def test_hilly_ground_changes_only_the_height_of_boxes():
+    """The networks get the points on flat ground."""
+    detector = load_fused_detector("", "cpu", EAGER).with_range("around")
+    scan = SimulatedScenes(7, 1, find_sensor("hdl64e", 0.0), Scenes(None, 3.0, "street"),
+                           around=True).frame(0).load()
+
+    def hills(xy: np.ndarray) -> np.ndarray:
+        return 0.04 * xy[:, 0] + 0.5 * np.sin(xy[:, 1] / 12)
+    xyz = scan.xyz + np.outer(hills(scan.xyz), [0, 0, 1]).astype(np.float32)
+    plain, hilly = detector(scan).detections, detector(replace(scan, xyz=xyz)).detections
+    plain = plain[plain.scores > 0.8]
+    distances = centre_distances(plain.boxes, hilly.boxes)
+    found = distances.min(axis=1) < 0.2
+    assert found.sum() > 3 and found.mean() > 0.8
+    rise = (hilly.boxes[distances.argmin(axis=1), 2] - plain.boxes[:, 2])[found]
+    np.testing.assert_allclose(rise, hills(plain.boxes)[found], atol=0.1)
+    assert np.ptp(rise) > 0.5
 
 
 @pytest.mark.parametrize("height, stays", [(0.4, True), (1.0, True), (1.73, False), (6.0, True)])

@@ -54,19 +54,21 @@ from lidar_perception.detectors.pointpillars.params import DetectorParams, Point
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
 from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.geometry import bev_iou, centre_distances
-from lidar_perception.ground.surface import fit_ground_heights
+from lidar_perception.ground.surface import GroundSurface, fit_ground_surface
 from lidar_perception.intensity import has_usable_intensity
-from lidar_perception.types import CLASSES, Detections, PointCloud
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, PointCloud
+
+MAX_RELIEF_M = 2.0  # height of hills, and depth of hollows, around the sensor
 
 
 class Proposals(NamedTuple):
-    """Proposed boxes in a NormalizedView with the evidence for them.
+    """Proposed boxes in a NormalizedView with flat ground and the evidence for them.
 
     Attributes:
         detections: K proposals; boxes that PointNet classified are moved towards its boxes.
         evidence: log-odds (K,) of each source.
         obstacles: (N, 3) xyz of the points of the view that are not ground.
-        ground: (G, 3) xyz of the ground points of the view.
+        surface: surface of the ground before it was made flat.
         problem: why nothing or little can be detected, or None.
         timings: milliseconds of each step.
     """
@@ -74,7 +76,7 @@ class Proposals(NamedTuple):
     detections: Detections
     evidence: Evidence
     obstacles: np.ndarray
-    ground: np.ndarray
+    surface: GroundSurface
     problem: str | None
     timings: dict[str, float]
 
@@ -144,24 +146,31 @@ class FusedDetector(NetworkDetector):
         """
         times = [perf_counter()]
         settings, params, config = self.settings, self.params, self.proposer.config
-        view = NormalizedView.of(frame, params.ground.sensor_pose, config.low, config.high,
-                                 settings.use_intensity)
+        low, high, relief = config.low, config.high, np.array([0, 0, MAX_RELIEF_M])
+        wide = NormalizedView.of(frame, params.ground.sensor_pose, tuple(low - relief),
+                                 tuple(high + relief), settings.use_intensity)
+        view = wide.crop(low, high)
         times.append(perf_counter())
         is_ground = (segment_view_ground(view.frame, params.ground) if ground is None
                      else ground.take(view.indices))
-        obstacles = view.frame.take(np.flatnonzero(~is_ground))
-        floor = view.frame.xyz.compress(is_ground, axis=0)
+        surface = fit_ground_surface(view.frame.xyz.compress(is_ground, axis=0), -SENSOR_HEIGHT)
+        flat = wide.flatten(surface).crop(low, high)
+        flat_ground = view.convert(is_ground, flat)
+        assert flat_ground is not None
+        obstacles = flat.frame.take(np.flatnonzero(~flat_ground))
+        floor = flat.frame.xyz.compress(flat_ground, axis=0)
         times.append(perf_counter())
         # Compiled code releases the GIL, and much of PointPillars runs in one thread.
         with ThreadPoolExecutor(1) as pool:
-            clusters = pool.submit(cluster_obstacles, view.frame.xyz, is_ground, params.people,
+            clusters = pool.submit(cluster_obstacles, flat.frame.xyz, flat_ground, params.people,
                                    frame.xyz)
-            columns = run_experts(view.frame, config, is_ground, view.take(cluster_ids),
-                                  params.ground, params.clustering)
+            _, cluster_ids = run_experts(view.frame, config, is_ground, view.take(cluster_ids),
+                                         params.ground, params.clustering)
             found = self.proposer.propose(
-                view, *columns, ScoreParams.for_all_classes(settings.proposals),
+                flat, flat_ground, view.convert(cluster_ids, flat),
+                ScoreParams.for_all_classes(settings.proposals),
                 replace(settings.nms, max_boxes=settings.max_proposals), settings.cpu_fallback)
-            people = clusters.result()[~is_ground]
+            people = clusters.result()[~flat_ground]
         times.append(perf_counter())
         proposed = drop_ego_vehicle(found.detections, view.pose.height)
         evidence = {"network": to_log_odds(proposed.scores), "silhouette": to_log_odds(
@@ -173,7 +182,7 @@ class FusedDetector(NetworkDetector):
         evidence["classifier"] = to_log_odds(probability)
         boxes = move_towards(proposed.boxes, boxes, settings.classifier_box).astype(np.float32)
         times.append(perf_counter())
-        return Proposals(replace(proposed, boxes=boxes), evidence, obstacles.xyz, floor,
+        return Proposals(replace(proposed, boxes=boxes), evidence, obstacles.xyz, surface,
                          found.problem, dict(zip(STEPS, (np.diff(times) * 1e3).tolist())))
 
     def decide(self, proposals: Proposals) -> tuple[Detections, dict[str, float]]:
@@ -191,7 +200,8 @@ class FusedDetector(NetworkDetector):
                 for name in self.classes}
         boxes = move_cars_to_points(found.boxes, found.class_ids, proposals.obstacles,
                                     settings.on_points)
-        heights = fit_ground_heights(proposals.ground, boxes[:, :2])
+        heights = proposals.surface.at(boxes)
+        boxes[:, 2] += heights + SENSOR_HEIGHT
         moved = replace(found, boxes=move_to_ground(boxes, heights, settings.on_ground).astype(
             np.float32))
         return moved[remove_duplicates(moved, settings)], {}
