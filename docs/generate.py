@@ -1,12 +1,16 @@
-"""Generate docs/reference/nodes/*.md and config/*.param.yaml from parameters: docs/generate.py
+"""Generate pages and parameter files from the code: python docs/generate.py
 
-test/test_docs.py checks that the pages are up to date and list the topics of the running nodes.
+These are docs/reference/nodes/*.md and config/*.param.yaml, from parameters, and the tables of
+docs/explanation/papers.md. test/test_docs.py checks that they are up to date and list the topics of
+the running nodes.
 """
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -20,7 +24,11 @@ from lidar_perception.nodes.graph import NETWORKS
 from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.param_fields import flatten
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # experiments/ is not installed
+from experiments.departures import DEPARTURES, MEASURED
+
 CONFIG = Path(__file__).parents[1] / "config"
+PAPERS = Path(__file__).parent / "explanation" / "papers.md"
 BEST = CONFIG / "best.param.yaml"
 FOLDER = Path(__file__).parent / "reference" / "nodes"
 CLOUD, MARKERS = "sensor_msgs/PointCloud2", "visualization_msgs/MarkerArray"
@@ -273,6 +281,31 @@ def _parameter_table(known: dict[str, Any], names: list[str]) -> list[str]:
     return rows
 
 
+def papers() -> str:
+    """Return the page of the papers with new tables between its marks."""
+    measured = [row._replace(command=f"`{row.command}`") for row in MEASURED]
+    text = _replace_table(PAPERS.read_text(), "departures", (
+        "paper, place", "the paper", "here", "option for the paper's reading"), DEPARTURES)
+    return _replace_table(text, "measured", ("paper, place", "what", "command", "data"), measured)
+
+
+def _replace_table(text: str, mark: str, header: tuple[str, ...],
+                   rows: Sequence[NamedTuple]) -> str:
+    """Return the text of a page with a table between the two lines with a mark."""
+    begin, end = f"<!-- {mark}: made by docs/generate.py -->\n", f"<!-- end of {mark} -->\n"
+    before, found, rest = text.partition(begin)
+    _, found_end, after = rest.partition(end)
+    if not (found and found_end):
+        raise ValueError(f"the page needs the lines {begin!r} and {end!r}")
+    table = "\n".join(_table(header, rows))
+    return f"{before}{begin}\n{table}\n\n{end}{after}"
+
+
+def _table(header: tuple[str, ...], rows: Sequence[NamedTuple]) -> list[str]:
+    return ["| " + " | ".join(header) + " |", "|---" * len(header) + "|",
+            *("| " + " | ".join(row) + " |" for row in rows)]
+
+
 def best() -> str:
     """Return the parameter file of the configuration `best`, for nodes."""
     return _parameter_file("The configuration `best` (lidar_perception/candidates/"
@@ -328,6 +361,7 @@ if __name__ == "__main__":
     FOLDER.mkdir(exist_ok=True)
     for name in PAGES:
         (FOLDER / f"{name}.md").write_text(page(name))
+    PAPERS.write_text(papers())
     BEST.write_text(best())
     for network in NETWORKS:
         config_file(network).write_text(config(network))

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+import yaml
 
 from lidar_perception.nodes import NODES, load_node_class
 from lidar_perception.nodes.main import help_text
@@ -42,6 +43,29 @@ def test_every_node_has_a_page():
 def test_pages_are_made_from_the_code(generate, name):
     page = ROOT / "docs" / "reference" / "nodes" / f"{name}.md"
     assert page.read_text() == generate.page(name), "run: python docs/generate.py"
+
+
+def test_tables_of_the_papers_are_made_from_the_code(generate):
+    assert generate.PAPERS.read_text() == generate.papers(), "run: python docs/generate.py"
+
+
+def test_options_for_readings_of_the_papers_exist():
+    from experiments.departures import DEPARTURES
+    from lidar_perception.candidates.params import PipelineParams
+    from lidar_perception.detectors.pointpillars.config import make_config
+    from lidar_perception.param_fields import with_values
+    from lidar_perception.training.params import PointNetTraining
+    for option in re.findall("`([^`]*)`", " ".join(row.option for row in DEPARTURES)):
+        if match := re.fullmatch(r"([a-z_]+)='?([^']*)'?", option):  # of make_config
+            kind = type(getattr(make_config(), match[1]))
+            make_config(**{match[1]: kind(match[2])})
+        elif match := re.fullmatch(r"train pointnet --network (\S+)", option):
+            with_values(PointNetTraining(), {"network": match[1]})
+        elif "." in option:
+            name, _, value = option.partition(": ")
+            assert name in collect_fields(PipelineParams()), option
+            if value:
+                with_values(PipelineParams(), {name: yaml.safe_load(value)})
 
 
 @pytest.mark.parametrize("name", ["ground_segmentation", "clustering", "candidate_refinement",
