@@ -44,9 +44,8 @@ def measure_dbscan(title: str, clouds: list[np.ndarray], repeat: int, target: fl
                      for p in group}
     faster = min((p.name for p in peers.SKLEARN), key=lambda name: ms[name])
     rows[faster] = add_target(rows[faster], target)
-    return make_measurement(
-        title, len(clouds), np.median([len(c) for c in clouds]), list(rows.values())
-    )
+    return make_measurement(title, len(clouds), np.median([len(c) for c in clouds]),
+                            list(rows.values()))
 
 
 def measure_dbscans(chosen: list[int], clouds: list[np.ndarray], repeat: int,

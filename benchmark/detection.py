@@ -59,9 +59,8 @@ def measure_detection(scans: list[PointCloud], repeat: int,
     return content
 
 
-def _compute_medians(
-    detectors: dict[str, PointPillarsDetector], scans: list[PointCloud], repeat: int, title: str
-) -> dict[str, dict]:
+def _compute_medians(detectors: dict[str, PointPillarsDetector], scans: list[PointCloud],
+                     repeat: int, title: str) -> dict[str, dict]:
     ms = {version: np.zeros((len(scans), repeat, len(STEPS))) for version in detectors}
     for i, scan in enumerate(show_progress(scans, title, len(scans))):
         for j in range(repeat):

@@ -48,9 +48,8 @@ def measure_patchwork(frames: list[PointCloud], repeat: int) -> dict:
     title, name = "Patchwork++, whole scan", peers.PATCHWORK.name
     points = np.median([len(f) for f in frames])
     if peers.PATCHWORK.missing():
-        return make_measurement(
-            title, len(frames), points, [make_row(name, note=peers.PATCHWORK.missing())]
-        )
+        return make_measurement(title, len(frames), points,
+                                [make_row(name, note=peers.PATCHWORK.missing())])
 
     def calls(frame, cloud):
         return {name: partial(peers.PATCHWORK.run, cloud, SENSOR_HEIGHT),
@@ -82,9 +81,8 @@ def measure_cloth(scans: list[np.ndarray], repeat: int) -> dict:
     scans = [_within(xyz) for xyz in scans]
     points = np.median([len(s) for s in scans])
     if peers.CLOTH.missing():
-        return make_measurement(
-            title, len(scans), points, [make_row(name, note=peers.CLOTH.missing())]
-        )
+        return make_measurement(title, len(scans), points,
+                                [make_row(name, note=peers.CLOTH.missing())])
 
     def calls(xyz, precise):
         return {name: partial(peers.CLOTH.run, precise), "ours": partial(segment_by_cloth, xyz)}

@@ -251,21 +251,25 @@ def _print_pace(content: dict, rate: float, clouds: int) -> None:
 
 def _print_tracks(frames: Sequence[RecordedResult], calibration: Any, poses: str) -> dict:
     """Print and return the scores of the tracks by class, and the source of the poses."""
-    from lidar_perception.scoring.tracking.from_bag import score_recorded_tracks
+    from lidar_perception.scoring.tracking.from_bag import (
+        count_recorded_tracks,
+        score_recorded_tracks,
+    )
     from lidar_perception.scoring.tracking.tables import EGO_TITLES
-    result = score_recorded_tracks(frames, calibration)
+    count, result = count_recorded_tracks(frames), {}
+    try:
+        result = score_recorded_tracks(frames, calibration)
+    except InputError as error:
+        console.print(f"tracks: {count}; HOTA is not known: {error}")
     for name in DETECTED:
-        scores, count = result.scores.get(name), result.count.get(name, 0)
-        if scores:
+        if scores := result.get(name):
             console.print(
-                f"tracks of {name}: {count}, {scores['true_tracks']} labelled; "
+                f"tracks of {name}: {count.get(name, 0)}, {scores['true_tracks']} labelled; "
                 f"{scores['switches']} identity switches, HOTA {100 * scores['HOTA']:.1f} "
                 f"(detection {100 * scores['DetA']:.1f}, association {100 * scores['AssA']:.1f})")
-    if result.problem:
-        console.print(f"tracks: {result.count}; HOTA is not known: {result.problem}")
     remedy = "; pip install 'lidar_perception[odometry]' takes them from the scans"
     console.print(f"tracks are with {EGO_TITLES[poses]}{remedy * (poses == NO_SOURCE)}")
-    return {"found": result.count, "scores": result.scores}
+    return {"found": count, "scores": result}
 
 
 def _drawn(frames: Sequence[RecordedResult], detector: str) -> dict[int, tuple[np.ndarray, Any]]:

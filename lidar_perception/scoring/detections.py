@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Generic, TypeVar
+
+import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame, Recording
@@ -20,8 +23,7 @@ from lidar_perception.data.kitti.results import (
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.runs import journal
 from lidar_perception.scoring.run import Start
-from lidar_perception.scoring.thinning import thin_points
-from lidar_perception.types import Detections, GroundTruth, InputError, RunError
+from lidar_perception.types import Detections, GroundTruth, InputError, PointCloud, RunError
 
 BoxesT = TypeVar("BoxesT", bound=Detections | GroundTruth)
 
@@ -47,22 +49,36 @@ class FrameDetections(Generic[BoxesT]):
     problem: str | None = None
 
 
+def thin_scan(frame: PointCloud, share: float, name: str) -> PointCloud:
+    """Return a random share (0..1) of the points of a frame, as of a sparser sensor (paper C).
+
+    The choice depends on the name of the frame only. A smaller share is a subset of a larger one.
+    """
+    if share >= 1.0:
+        return frame
+    return frame.take(np.flatnonzero(draw_subset(len(frame), share, name)))
+
+
+def draw_subset(count: int, share: float, name: str) -> np.ndarray:
+    """Return a mask (count,) bool of a random share of the points, seeded by name."""
+    return np.random.default_rng(zlib.crc32(name.encode())).random(count) < share
+
+
 def run_detector(detector: Detector, frame: Frame, truth: GroundTruth | None,
                  calibration: Calibration | None, keep: float = 1.0) -> FrameDetections[Detections]:
     """Run a detector on a share `keep` of the points of a frame.
 
     Raises InputError if the scan cannot be read.
     """
-    scan = thin_points(frame.load(), keep, frame.name)
+    scan = thin_scan(frame.load(), keep, frame.name)
     begin = perf_counter()
     try:
         found = detector(scan)
     except RunError:
         raise
     except InputError as error:
-        return FrameDetections(
-            frame.name, truth, Detections.none(), calibration, problem=str(error)
-        )
+        return FrameDetections(frame.name, truth, Detections.none(), calibration,
+                               problem=str(error))
     return FrameDetections(frame.name, truth, found.detections, calibration,
                            (perf_counter() - begin) * 1e3)
 
@@ -78,9 +94,9 @@ def measure_detector(open_: Callable[[], Detector], keep: float = 1.0, folder: P
     return partial(_measure_detector, open_, keep, folder)
 
 
-def _measure_detector(
-    open_: Callable[[], Detector], keep: float, folder: Path | None, recording: Recording
-) -> Callable[[Frame], FrameDetections[Detections] | None]:
+def _measure_detector(open_: Callable[[], Detector], keep: float, folder: Path | None,
+                      recording: Recording
+                      ) -> Callable[[Frame], FrameDetections[Detections] | None]:
     detector = open_()
 
     def measure(frame: Frame) -> FrameDetections[Detections] | None:

@@ -35,9 +35,8 @@ def group_frames(names: Sequence[str], follow: bool = False) -> list[np.ndarray]
             for i in range(0, len(frames), BLOCK_FRAMES)]
 
 
-def compute_interval(
-    score: Callable[[np.ndarray], float | None], parts: Sequence[np.ndarray], count: int
-) -> list[float] | None:
+def compute_interval(score: Callable[[np.ndarray], float | None], parts: Sequence[np.ndarray],
+                     count: int) -> list[float] | None:
     """Return [low, high] of score(frames) over `count` draws of the groups in parts.
 
     frames (F,) are indices. Returns None for fewer than two groups, or if no draw has a score.
@@ -57,8 +56,5 @@ def compute_bounds(scores: Iterable[float | None]) -> list[float] | None:
     found = [score for score in scores if score is not None]
     if not found:
         return None
-    return (
-        np.percentile(found, [(100 - INTERVAL_PERCENT) / 2, (100 + INTERVAL_PERCENT) / 2])
-        .round(2)
-        .tolist()
-    )
+    limits = (100 - INTERVAL_PERCENT) / 2, (100 + INTERVAL_PERCENT) / 2
+    return np.percentile(found, limits).round(2).tolist()

@@ -168,9 +168,8 @@ def _make_worker(reopen: Callable[[], Recording], start: Start) -> Callable[[int
 _get_worker = functools.lru_cache(maxsize=1)(lambda run, reopen, start: _make_worker(reopen, start))
 
 
-def _measure_on_cluster(
-    run: str, reopen: Callable[[], Recording], start: Start, i: int
-) -> tuple[int, Any]:
+def _measure_on_cluster(run: str, reopen: Callable[[], Recording], start: Start,
+                        i: int) -> tuple[int, Any]:
     """Measure a frame in a process that other runs may share."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # for libraries that are loaded later
     with threadpool_limits(1):

@@ -134,6 +134,5 @@ class EgoParams(Params):
                            "extrapolation after the last one; beyond that the tracker "
                            "applies max_ego_gap.",
                            unit="s", low=0.0, high=100.0)
-    max_wait: float = param(
-        0.2, "Longest wait of a frame for a pose that arrives late.", unit="s", low=0.0, high=100.0
-    )
+    max_wait: float = param(0.2, "Longest wait of a frame for a pose that arrives late.", unit="s",
+                            low=0.0, high=100.0)

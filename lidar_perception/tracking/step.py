@@ -34,17 +34,11 @@ def predict(states: States, seconds: float, params: TrackingParams) -> States:
                                         *(_collect_by_kind(params, name)[kinds] for name in
                                           ("acceleration", "turning", "wandering")))
     fade = np.exp(-seconds / params.existence.memory)
-    return replace(
-        states,
-        means=means,
-        covariances=covariances,
-        ages=states.ages + seconds,
-        unseen=states.unseen + seconds,
-        total=states.total * fade,
-        observations=states.observations * fade,
-        class_evidence=states.class_evidence * fade,
-        height_variances=states.height_variances + HEIGHT_DRIFT**2 * seconds,
-    )
+    return replace(states, means=means, covariances=covariances, ages=states.ages + seconds,
+                   unseen=states.unseen + seconds, total=states.total * fade,
+                   observations=states.observations * fade,
+                   class_evidence=states.class_evidence * fade,
+                   height_variances=states.height_variances + HEIGHT_DRIFT**2 * seconds)
 
 
 def match(states: States, boxes: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
@@ -138,26 +132,12 @@ def start_tracks(first_id: int, boxes: np.ndarray, class_ids: np.ndarray, scores
     own, zeros, ones = params.existence, np.zeros(count), np.ones(count)
     votes = np.zeros((count, len(CLASSES)))
     votes[np.arange(count), class_ids] = scores
-    return States(
-        first_id + np.arange(count),
-        means,
-        covariances,
-        boxes[:, 2].copy(),
-        np.full(count, HEIGHT_NOISE**2),
-        boxes[:, 3:6].copy(),
-        scores.copy(),
-        votes,
-        class_ids.astype(np.int32),
-        existence.compute_evidence(scores, own),
-        ones,
-        np.full(count, own.seen / 2),
-        ones.copy(),
-        ones.copy(),
-        compute_moving_probability(means, covariances, params.moving_speed),
-        zeros.copy(),
-        zeros.copy(),
-        scores.copy(),
-    )
+    return States(first_id + np.arange(count), means, covariances, boxes[:, 2].copy(),
+                  np.full(count, HEIGHT_NOISE**2), boxes[:, 3:6].copy(), scores.copy(), votes,
+                  class_ids.astype(np.int32), existence.compute_evidence(scores, own), ones,
+                  np.full(count, own.seen / 2), ones.copy(), ones.copy(),
+                  compute_moving_probability(means, covariances, params.moving_speed), zeros.copy(),
+                  zeros.copy(), scores.copy())
 
 
 def prune(states: States, params: TrackingParams, fixed: bool) -> States:
@@ -165,9 +145,8 @@ def prune(states: States, params: TrackingParams, fixed: bool) -> States:
     states = states.take(np.flatnonzero(
         existence.to_probability(states.present) >= params.existence.end))
     rank = compute_probabilities(states, params, fixed)
-    kept = rotated_nms(
-        states.to_boxes(), rank, states.class_ids, params.overlap, across_classes=True
-    )
+    kept = rotated_nms(states.to_boxes(), rank, states.class_ids, params.overlap,
+                       across_classes=True)
     return states.take(np.sort(kept[:params.max_tracks]))
 
 

@@ -199,9 +199,8 @@ def _to_sensor_frame(states: States, ego: Ego, seen: np.ndarray,
     side = -1.0 if back[2, 2] < 0 else 1.0  # upside-down sensor
     covariances = motion.rotate_covariances(chosen.covariances, cos, sin, side)
     velocities = chosen.means[:, 2:4] @ np.array([[cos, sin], [-side * sin, side * cos]])
-    detections = Detections.of(
-        transform_boxes(chosen.to_boxes(), back), chosen.class_ids, scores[indices]
-    )
+    detections = Detections.of(transform_boxes(chosen.to_boxes(), back), chosen.class_ids,
+                               scores[indices])
     return Tracks(chosen.ids, detections, velocities, chosen.moving, covariances,
                   side * chosen.means[:, 5],
                   chosen.height_variances, seen[indices], chosen.ages)

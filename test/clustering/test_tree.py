@@ -36,20 +36,18 @@ def sphere(rng, n):
 
 
 # Clouds with many points in one neighbourhood of a grid: rng, n -> (n, 3).
-ARRANGEMENTS = {
-    "a cube": lambda rng, n: rng.random((n, 3)),
-    "equal": lambda rng, n: np.full((n, 3), 0.3),
-    "a line": lambda rng, n: np.linspace(0, 1, n)[:, None] * [1, 2, -1],
-    "a sphere": sphere,
-    "a sphere and its centre": lambda rng, n: np.concatenate(
-        [sphere(rng, n // 2), rng.normal(0, 1e-5, (n - n // 2, 3))]),
-    "two blobs out of reach": lambda rng, n: rng.random((n, 3)) * 0.1
-    + (np.arange(n) % 2)[:, None] * [0, 0, 0.7],
-    "a blob and dust": lambda rng, n: rng.random((n, 3)) * np.where(np.arange(n) % 2, 1e-3, 3)[
-        :, None],
-    "parallel walls": lambda rng, n: np.column_stack([np.arange(n) % 2 * 0.31, rng.random((n, 2))]),
-    "a few indices": lambda rng, n: rng.integers(0, 3, (n, 3)) * 0.25,
-}
+ARRANGEMENTS = {"a cube": lambda rng, n: rng.random((n, 3)), "equal": lambda rng,
+                n: np.full((n, 3), 0.3), "a line": lambda rng,
+                n: np.linspace(0, 1, n)[:, None] * [1, 2, -1], "a sphere": sphere,
+                "a sphere and its centre": lambda rng,
+                n: np.concatenate([sphere(rng, n // 2), rng.normal(0, 1e-5, (n - n // 2, 3))]),
+                "two blobs out of reach": lambda rng,
+                n: rng.random((n, 3)) * 0.1 + (np.arange(n) % 2)[:, None] * [0, 0, 0.7],
+                "a blob and dust": lambda rng,
+                n: rng.random((n, 3)) * np.where(np.arange(n) % 2, 1e-3, 3)[:, None],
+                "parallel walls": lambda rng,
+                n: np.column_stack([np.arange(n) % 2 * 0.31, rng.random((n, 2))]),
+                "a few indices": lambda rng, n: rng.integers(0, 3, (n, 3)) * 0.25}
 each_arrangement = pytest.mark.parametrize("arrange", ARRANGEMENTS.values(), ids=ARRANGEMENTS)
 
 

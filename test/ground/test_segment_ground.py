@@ -37,13 +37,11 @@ def test_a_flat_road_is_ground_and_objects_are_not(method):
     assert f1(segment(xyz, method)[beyond], road[beyond]) > 0.97
 
 
-BAD = {
-    "empty": np.zeros((0, 3)), "one point": [[5, 0, -1.7]], "origin": np.zeros((50, 3)),
-    "all NaN": np.full((50, 3), np.nan), "all infinite": np.full((50, 3), -np.inf),
-    "all equal": np.full((50, 3), 4.0), "line": np.linspace(1, 9, 50)[:, None] * [1, 1, 0],
-    "100 km": [[1e5, 0, 0], [0, 1e5, 1e5], [5, 5, -1.7]], "huge": np.full((5, 3), 3e38),
-    "one below": np.concatenate([np.full((99, 3), 4.0), [[5, 5, -1e4]]]),
-}
+BAD = {"empty": np.zeros((0, 3)), "one point": [[5, 0, -1.7]], "origin": np.zeros((50, 3)),
+       "all NaN": np.full((50, 3), np.nan), "all infinite": np.full((50, 3), -np.inf),
+       "all equal": np.full((50, 3), 4.0), "line": np.linspace(1, 9, 50)[:, None] * [1, 1, 0],
+       "100 km": [[1e5, 0, 0], [0, 1e5, 1e5], [5, 5, -1.7]], "huge": np.full((5, 3), 3e38),
+       "one below": np.concatenate([np.full((99, 3), 4.0), [[5, 5, -1e4]]])}
 
 
 @each_method

@@ -19,9 +19,8 @@ from lidar_perception.types import Detections, GroundTruth
 def frame(true: np.ndarray, found: np.ndarray, scores=0.9):
     truth = GroundTruth.of(true, np.full(len(true), CAR))
     detections = Detections.of(found, CAR, scores)
-    return compare_objects(
-        to_camera_objects(truth, None), to_camera_objects(to_scored_labels(detections), None)
-    )
+    return compare_objects(to_camera_objects(truth, None),
+                           to_camera_objects(to_scored_labels(detections), None))
 
 
 def cars(count: int, rng) -> np.ndarray:

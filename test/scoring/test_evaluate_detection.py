@@ -15,9 +15,9 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.params import MIN_SCORE
+from lidar_perception.scoring.detections import thin_scan
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED
 from lidar_perception.scoring.kitti.report import INTERVALS
-from lidar_perception.scoring.thinning import thin_points
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, InputError
 
 PERSON, CAR, REGION = LABELS.splitlines()
@@ -157,11 +157,11 @@ def test_a_smaller_share_is_part_of_a_larger_one(kitti):
     frame = open_recording(kitti).frames[0].load()
     before = frame
     for share in (1.0, 0.5, 0.2, 0.1, 0.0):
-        now = thin_points(frame, share, "000000")
+        now = thin_scan(frame, share, "000000")
         assert set(map(bytes, now.xyz)) <= set(map(bytes, before.xyz))
         assert abs(len(now) - share * len(frame)) <= 3 * np.sqrt(len(frame))
         before = now
-    assert thin_points(frame, 1.0, "a") is frame and len(before) == 0
+    assert thin_scan(frame, 1.0, "a") is frame and len(before) == 0
 
 
 def test_written_results_score_as_what_was_found(kitti, detector, tmp_path):

@@ -195,9 +195,8 @@ def test_the_same_as_a_second_reading(tmp_path, seed, frames, objects, noise):
     by_class, over = reference.evaluate(tables, results, CATEGORIES)
     content = reported(folder.save(tmp_path, tables, sweeps=False), results)
     assert content["frames"] == 2 * frames and 0 < content["all"]["map"] < 100
-    close_to_reference(
-        content, by_class, {"all": over, "ours": reference.over(by_class, DETECTED_NAMES)}
-    )
+    close_to_reference(content, by_class,
+                       {"all": over, "ours": reference.over(by_class, DETECTED_NAMES)})
 
 
 @pytest.mark.parametrize("seed, ties", [(4, False), (5, False), (4, True)])

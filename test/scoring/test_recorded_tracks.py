@@ -10,10 +10,10 @@ from tracking_samples import START, TENTH, crowd
 
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.scoring.recorded import read_results
-from lidar_perception.scoring.tracking.from_bag import score_recorded_tracks
+from lidar_perception.scoring.tracking.from_bag import count_recorded_tracks, score_recorded_tracks
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
-from lidar_perception.types import GroundTruth
+from lidar_perception.types import GroundTruth, InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_truth_markers
 from lidar_perception.wire.topics import TRUTH
@@ -47,19 +47,18 @@ def recorded(request, tmp_path):
 
 def test_recorded_tracks_are_scored_if_labels_have_ids(recorded):
     path, with_ids, _ = recorded
-    result = score_recorded_tracks(read_results(path, TRACKS)[0], None)
-    assert result.count == {"Car": 2, "Cyclist": 1, "Pedestrian": 3}
+    frames = read_results(path, TRACKS)[0]
+    assert count_recorded_tracks(frames) == {"Car": 2, "Cyclist": 1, "Pedestrian": 3}
     if with_ids:
-        scores = result.scores["Pedestrian"]
-        assert (scores["true_tracks"], scores["switches"], result.problem) == (3, 0, None)
-        assert scores["HOTA"] > 0.8
-        frames = read_results(path, TRACKS)[0]
+        scores = score_recorded_tracks(frames, None)["Pedestrian"]
+        assert (scores["true_tracks"], scores["switches"]) == (3, 0) and scores["HOTA"] > 0.8
         later = [replace(f, stamp_ns=f.stamp_ns + 600 * TENTH,
                          found=replace(f.found, ids=np.asarray(f.found.ids) + 100)) for f in frames]
-        both = score_recorded_tracks([*frames, *later], None).scores["Pedestrian"]  # two drives
+        both = score_recorded_tracks([*frames, *later], None)["Pedestrian"]  # two drives
         assert (both["true_tracks"], both["switches"], both["HOTA"]) == (6, 0, scores["HOTA"])
     else:
-        assert result.scores == {} and "track id" in result.problem
+        with pytest.raises(InputError, match="track id"):
+            score_recorded_tracks(frames, None)
     assert read_results(path, "/nothing")[0] == []
 
 

@@ -137,11 +137,8 @@ def test_drives_that_share_a_bag_are_scored_as_if_they_had_names():
                 frames.append(Frame.of(f"{k}/{i}", scan, truth, sequence=str(k) * named,
                                        index=i if named else len(frames)))
         recording, report = Recording("a", "", frames), TrackingReport()
-        fill(
-            report,
-            recording,
-            measure_tracking(lambda: lambda scan: found[scan.stamp_ns], ego="none"),
-        )
+        fill(report, recording,
+             measure_tracking(lambda: lambda scan: found[scan.stamp_ns], ego="none"))
         return report.compute()
 
     assert content(False) == content(True)

@@ -82,9 +82,8 @@ def test_lateral_speed_shrinks_and_reversed_heading_flips():
     across = [np.cos(m[4]) * m[3] - np.sin(m[4]) * m[2] for m in (means[0], kept[0])]
     assert abs(across[1]) < 0.2 * abs(across[0]) and (np.linalg.eigvalsh(p) > 0).all()
     backwards = np.array([[0.0, 0, -5, 0, 0.2, 0], [0, 0, -0.5, 0, 0.2, 0]])
-    flipped, agreement = flip_reversed_headings(
-        backwards, np.array([9.0, 9.0]), np.array([2.0, 2.0])
-    )
+    flipped, agreement = flip_reversed_headings(backwards, np.array([9.0, 9.0]),
+                                                np.array([2.0, 2.0]))
     assert flipped[:, 4] == pytest.approx([0.2 - np.pi, 0.2])
     assert agreement.tolist() == [-9, 9]
     again, _ = flip_reversed_headings(flipped, agreement, np.full(2, 2.0))

@@ -79,7 +79,7 @@ def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> Non
     from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
     from lidar_perception.scoring.centres.report import load_pedestrians, make_seed_source
     from lidar_perception.types import PointCloud
-    best = report.find_most_crowded()
+    _, best = report.most_crowded
     if best is None:
         return
     templates = None if params.seed.source == "ground_truth" else load_seeds(params.seed.file)

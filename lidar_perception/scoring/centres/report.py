@@ -98,9 +98,8 @@ def collect_boxes(candidates: Candidates) -> dict[str, np.ndarray]:
     return {stage: getattr(candidates, stage).boxes for stage in STAGES}
 
 
-def make_seed_source(
-    truth: np.ndarray, templates: Sequence[Seed] | None, params: PipelineParams
-) -> SeedSource:
+def make_seed_source(truth: np.ndarray, templates: Sequence[Seed] | None,
+                     params: PipelineParams) -> SeedSource:
     """Make the source of a frame's seeds.
 
     Without templates the seed is a true pedestrian, truth (M, 7), as in the paper; otherwise
@@ -126,11 +125,7 @@ class CandidateReport:
     times: dict[str, deque[float]] = field(default_factory=dict)
     true_by_range: np.ndarray = field(default_factory=lambda: np.zeros(len(RANGE_NAMES), int))
     skipped: list[str] = field(default_factory=list)
-    most: tuple[int, str | None] = 0, None
-
-    def find_most_crowded(self) -> str | None:
-        """Return the name of the first frame with most pedestrians, or None."""
-        return self.most[1]
+    most_crowded: tuple[int, str | None] = 0, None  # number of pedestrians, name of the frame
 
     def update(self, result: CandidateResult) -> None:
         """Add one frame."""
@@ -138,8 +133,8 @@ class CandidateReport:
             self.skipped.append(result.problem)
         self.frames += 1
         self.true_by_range += np.bincount(find_range_bins(result.truth), minlength=len(RANGE_NAMES))
-        if result.name and len(result.truth) > self.most[0]:
-            self.most = len(result.truth), result.name
+        if result.name and len(result.truth) > self.most_crowded[0]:
+            self.most_crowded = len(result.truth), result.name
         for stage, boxes in result.boxes.items():
             self.scores.setdefault(stage, Score()).update(boxes, result.truth)
         if result.ms:
@@ -152,11 +147,8 @@ class CandidateReport:
 
     def compute(self) -> dict:
         """Return the content of the JSON file."""
-        return {
-            "frames": self.frames,
-            "ground_truth": int(self.true_by_range.sum()),
-            "ground_truth_by_range": dict(zip(RANGE_NAMES, self.true_by_range.tolist())),
-            **{stage: score.table() for stage, score in self.scores.items()},
-            "ms": {step: float(np.median(values)) for step, values in self.times.items()},
-            "skipped": self.skipped,
-        }
+        return {"frames": self.frames, "ground_truth": int(self.true_by_range.sum()),
+                "ground_truth_by_range": dict(zip(RANGE_NAMES, self.true_by_range.tolist())),
+                **{stage: score.table() for stage, score in self.scores.items()},
+                "ms": {step: float(np.median(values)) for step, values in self.times.items()},
+                "skipped": self.skipped}

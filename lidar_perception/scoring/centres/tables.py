@@ -32,14 +32,11 @@ def print_candidate_report(content: dict, console: Console) -> None:
             row = content[stage][name]
             if row["tp"] + row["fp"] + row["fn"] == 0 and name != "all":
                 continue
-            table.add_row(
-                STAGE_TITLES[stage] if name == "all" else "",
-                name,
-                *format_counts(row, "tp", "fp", "fn"),
-                *format_percent(row, "recall", "precision", "f1"),
-                format_number(row["centre_error_m"]),
-                style="bold" if name == "all" else "",
-            )
+            table.add_row(STAGE_TITLES[stage] if name == "all" else "", name,
+                          *format_counts(row, "tp", "fp", "fn"),
+                          *format_percent(row, "recall", "precision", "f1"),
+                          format_number(row["centre_error_m"]),
+                          style="bold" if name == "all" else "")
         recall, precision, f1, _, error = PAPER_TABLE_6[stage]
         table.add_row("  the paper", "all", "", "", "", f"{recall}", f"{precision}", f"{f1}",
                       f"{error:.2f}", style="dim", end_section=True)

@@ -73,13 +73,14 @@ def to_scored_labels(detections: Detections) -> GroundTruth:
 
 
 def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> CameraObjects:
-    """Convert labels, or detections with their score in extras. Notes (2D only) come last.
+    """Convert labels, or detections with their score in extras; notes (2D only) come last.
 
-    Values that a label file contains are kept. Missing ones (2D box, alpha) are computed from the
-    box. Truncation is also computed where the number is a level and not a share, as in the tracking
-    and raw layouts: it is then the share of the projected box outside the image.
+    Values of the label file are kept; a missing 2D box or alpha is computed from the box. So is
+    truncation where the file has a level instead of a share (tracking and raw layouts): it is the
+    share of the projected box outside the image.
 
-    Raises InputError if a box or score is not finite.
+    Raises:
+        InputError: a box or score is not finite.
     """
     scores = np.array([extra.get("score", 1.0) for extra in _list_extras(objects)])
     bad = ~np.isfinite(scores)
@@ -104,20 +105,12 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
     computed = np.where(whole, wrap_angle(turn - bearing), np.nan)
     return CameraObjects(
         class_ids=np.array(class_ids(label["class"] for label in labels), np.int32),
-        boxes=np.column_stack(
-            [
-                location[:, 2],
-                -location[:, 0],
-                sides[:, 0] / 2 - location[:, 1],
-                sides[:, [2, 1, 0]],
-                -turn - np.pi / 2,
-            ]
-        ),
+        boxes=np.column_stack([location[:, 2], -location[:, 0], sides[:, 0] / 2 - location[:, 1],
+                               sides[:, [2, 1, 0]], -turn - np.pi / 2]),
         image_boxes=np.where(has_pixels, given, projected),
         alpha=np.where(alpha > NO_ANGLE, alpha, computed),
-        truncated=np.array(
-            [_compute_truncation(e, o) for e, o in zip(_list_extras(objects), outside)]
-        ),
+        truncated=np.array([_compute_truncation(e, o)
+                            for e, o in zip(_list_extras(objects), outside)]),
         occluded=_read_columns(labels, "occluded").astype(int),
         scores=scores,
         regions=given[np.array([label["class"] == "DontCare" for label in labels], bool)],
@@ -126,9 +119,9 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
 
 def select_in_image(truth: GroundTruth, calibration: Calibration | None) -> GroundTruth:
     """Return the labels that are partly in the image, or all without a calibration."""
-    seen = np.flatnonzero(to_camera_objects(truth, calibration).pixels_high[:len(truth)] > 0)
-    return GroundTruth.of(truth.boxes[seen], truth.class_ids[seen],
-                          [truth.extras[i] for i in seen], truth.notes)
+    rows = np.flatnonzero(to_camera_objects(truth, calibration).pixels_high[:len(truth)] > 0)
+    return GroundTruth.of(truth.boxes[rows], truth.class_ids[rows],
+                          [truth.extras[i] for i in rows], truth.notes)
 
 
 def _make_without_camera(objects: GroundTruth, scores: np.ndarray) -> CameraObjects:

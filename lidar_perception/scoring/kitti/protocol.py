@@ -38,6 +38,7 @@ MAX_OCCLUDED = (0, 1, 2)
 MAX_TRUNCATED = (0.15, 0.3, 0.5)
 
 COUNTED, IGNORED, OTHER = 0, 1, -1
+EPS = np.finfo(float).eps  # smaller areas are 0
 
 
 @dataclass(frozen=True)
@@ -59,24 +60,25 @@ class ComparedFrame:
 def compare_objects(true: CameraObjects, found: CameraObjects) -> ComparedFrame:
     """Compute the overlaps of a frame. The order of the detections does not matter."""
     found = found.take(np.lexsort([*found.boxes.T, *found.image_boxes.T, -found.scores]))
-    shared = _intersect(found.image_boxes, true.image_boxes)
-    own, others = _compute_areas(found.image_boxes), _compute_areas(true.image_boxes)
-    with np.errstate(invalid="ignore", divide="ignore"):  # boxes without area overlap nothing
-        image = np.nan_to_num(shared / (own[:, None] + others - shared))
-        excused = np.nan_to_num(_intersect(found.image_boxes, true.regions) / own[:, None])
-    overlaps = np.stack([image, *bev_and_3d_iou(found.boxes, true.boxes)])
+    overlaps = np.stack([compute_image_iou(found.image_boxes, true.image_boxes),
+                         *bev_and_3d_iou(found.boxes, true.boxes)])
+    excused = compute_image_iou(found.image_boxes, true.regions, of_first=True)
     return ComparedFrame(true, found, overlaps, excused.max(axis=1, initial=0.0))
 
 
-def _compute_areas(boxes: np.ndarray) -> np.ndarray:
-    return np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
+def compute_image_iou(boxes: np.ndarray, others: np.ndarray, of_first: bool = False) -> np.ndarray:
+    """Compute the IoU (K, M) of 2D boxes (K, 4) and (M, 4) [left top right bottom].
 
-
-def _intersect(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Compute the intersection area (K, M) of 2D boxes (K, 4) and (M, 4)."""
+    With of_first, compute the share of each of boxes that is inside others. Both are 0 for a box
+    without area or of infinite size.
+    """
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
-    return np.prod(np.maximum(high - low, 0), axis=2)
+    areas, other_areas = (np.prod(b[:, 2:] - b[:, :2], axis=1) for b in (boxes, others))
+    shared = np.prod(np.maximum(high - low, 0.0), axis=2)
+    with np.errstate(invalid="ignore"):
+        whole = areas[:, None] + (0.0 if of_first else other_areas - shared)
+        return np.divide(shared, whole, out=np.zeros_like(shared), where=whole > EPS)
 
 
 @dataclass(frozen=True)
@@ -163,33 +165,29 @@ def compute_precision(frames: Comparison, name: str, metric: str, overlap: float
     if objects == 0:
         return None
     thresholds = choose_thresholds(_find_hit_scores(pairs), objects)
-    hits, wrong, turned = _count(frames, pairs, metric, thresholds)
+    hits, wrong, similarity = _count(frames, pairs, metric, thresholds)
     right = hits / np.maximum(hits + wrong, 1)
-    turned = turned / np.maximum(hits + wrong, 1)
+    oriented = similarity / np.maximum(hits + wrong, 1)
     return Precision(objects, *average_curve(sample_curve(right, objects)),
-                     *average_curve(sample_curve(turned, objects)),
+                     *average_curve(sample_curve(oriented, objects)),
                      *average_curve(sample_curve(right, objects, official=True)))
 
 
 def count_hits(frames: Comparison, name: str, metric: str, overlap: float, difficulty: str,
                thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Count right and wrong detections of at least each score of thresholds (T,), two (T,) float64.
+    """Count hits and wrong detections, each (T,) float64, with at least each score of thresholds.
 
-    The rules are those of compute_precision(); ignored detections are neither.
+    The rules are those of compute_precision(); ignored detections do not count.
     """
     pairs = _collect_pairs(frames, name, metric, overlap, difficulty)
     return _count(frames, pairs, metric, np.asarray(thresholds, np.float64))[:2]
 
 
 class _Pairs(NamedTuple):
-    """Pairs of labels and detections of all frames, for one class, metric and difficulty.
+    """Pairs of all frames for one class, metric and difficulty; see Comparison.
 
-    Attributes:
-        overlaps: (P,) of the pairs.
-        min_overlap: a hit has a larger one.
-        labels, detections: (M,) and (K,) int8 COUNTED, IGNORED or OTHER.
-        scores: (K,) of the detections.
-        first_true, first_found, first_pair: as in Comparison.
+    A hit overlaps by more than min_overlap. labels (M,) and detections (K,) int8 are COUNTED,
+    IGNORED or OTHER.
     """
 
     overlaps: np.ndarray
@@ -211,7 +209,6 @@ def _collect_pairs(frames: Comparison, name: str, metric: str, overlap: float,
 
 
 def _count(frames: Comparison, pairs: _Pairs, metric: str, thresholds: np.ndarray) -> tuple:
-    """Call _count_hits with pairs at thresholds (T,)."""
     excused = (frames.excused if metric == "image"
                else np.zeros(len(frames.found))) > pairs.min_overlap
     return _count_hits(pairs, thresholds, excused, frames.true.alpha, frames.found.alpha)
@@ -253,8 +250,7 @@ def _count_hits(pairs, thresholds, excused, true_alpha, found_alpha):
     is no other.
     """
     overlaps, min_overlap, labels, detections, scores, first_true, first_found, first_pair = pairs
-    hits, wrong, turned = (np.zeros(len(thresholds)), np.zeros(len(thresholds)),
-                           np.zeros(len(thresholds)))
+    hits, wrong, similarity = np.zeros((3, len(thresholds)))
     taken = np.zeros(len(scores), np.int64)  # at which threshold, from 1
     for f in range(len(first_pair) - 1):
         count = first_true[f + 1] - first_true[f]
@@ -279,8 +275,8 @@ def _count_hits(pairs, thresholds, excused, true_alpha, found_alpha):
                     taken[best] = t + 1
                     if labels[i] == COUNTED and detections[best] == COUNTED:
                         hits[t] += 1
-                        turned[t] += (1 + np.cos(true_alpha[i] - found_alpha[best])) / 2
+                        similarity[t] += (1 + np.cos(true_alpha[i] - found_alpha[best])) / 2
             for j in range(first_found[f], end):
                 if detections[j] == COUNTED and taken[j] != t + 1 and not excused[j]:
                     wrong[t] += 1
-    return hits, wrong, turned
+    return hits, wrong, similarity

@@ -11,8 +11,8 @@ import numpy as np
 from lidar_perception.scoring.centres.scores import CentreScores
 from lidar_perception.scoring.detections import FrameDetections
 from lidar_perception.scoring.intervals import compute_bounds, draw_samples, group_frames
+from lidar_perception.scoring.kitti.box_errors import diagnose_heights, measure_heights
 from lidar_perception.scoring.kitti.camera_objects import to_camera_objects, to_scored_labels
-from lidar_perception.scoring.kitti.matched_heights import diagnose_heights, measure_heights
 from lidar_perception.scoring.kitti.protocol import (
     DIFFICULTIES,
     RELAXED,
@@ -35,10 +35,9 @@ INTERVALS = "bev_relaxed", "bev", "3d"
 
 @dataclass
 class DetectionReport:
-    """Frames to score, names of skipped frames, and durations of the detector.
+    """Frames to score, reasons for skipped frames, and durations of the detector.
 
-    follow is True if frames without a drive in their name are consecutive, see
-    intervals.group_frames.
+    follow: see intervals.group_frames.
     """
 
     frames: list[ComparedFrame] = field(default_factory=list)
@@ -73,8 +72,7 @@ class DetectionReport:
         self.frames.append(compare_objects(true_objects, objects))
         self.names.append(result.name)
         self.with_camera &= calibration is not None
-        chosen = found.class_ids == PEDESTRIAN
-        chosen &= objects.pixels_high[:len(found)] > 0
+        chosen = (found.class_ids == PEDESTRIAN) & (objects.pixels_high[:len(found)] > 0)
         people = (truth.class_ids == PEDESTRIAN) & (true_objects.pixels_high[:len(truth)] > 0)
         self.pedestrians.update(truth.boxes[people], found.boxes[chosen],
                                 objects.scores[:len(found)][chosen], result.name)
@@ -86,8 +84,8 @@ class DetectionReport:
             "pedestrian_centres": self.pedestrians.compute(),
             "ms": float(np.median(self.ms)) if self.ms else None, "skipped": self.skipped}
         if self.frames:
-            concatenate = Comparison.of(self.frames)
-            result["ap"] = {name: self._class_content(concatenate, name) for name in SCORED}
+            comparison = Comparison.of(self.frames)
+            result["ap"] = {name: self._class_content(comparison, name) for name in SCORED}
             result["map_3d"] = average_3d(result["ap"])
             result["matched"] = {name: measure_heights(self.frames, name) for name in SCORED}
             result["diagnosis"] = [line for name in SCORED if (line := diagnose_heights(
@@ -102,17 +100,16 @@ class DetectionReport:
         found: dict[tuple[str, str], list[float | None]] = {
             (name, row): [] for name in SCORED for row in INTERVALS}
         for frames in draw_samples(group_frames(self.names, self.follow), count):
-            concatenate = Comparison.of([self.frames[i] for i in frames])
+            comparison = Comparison.of([self.frames[i] for i in frames])
             for (name, row), scores in found.items():
                 metric, overlaps = ROWS[row]
-                value = compute_precision(concatenate, name, metric, overlaps[name], "moderate")
+                value = compute_precision(comparison, name, metric, overlaps[name], "moderate")
                 scores.append(None if value is None else value.r40)
-        return {
-            name: {row: compute_bounds(found[name, row]) for row in INTERVALS} for name in SCORED
-        }
+        return {name: {row: compute_bounds(found[name, row]) for row in INTERVALS}
+                for name in SCORED}
 
-    def _class_content(self, concatenate: Comparison, name: str) -> dict:
-        rows = {row: {level: compute_precision(concatenate, name, metric, overlaps[name], level)
+    def _class_content(self, comparison: Comparison, name: str) -> dict:
+        rows = {row: {level: compute_precision(comparison, name, metric, overlaps[name], level)
                       for level in DIFFICULTIES}
                 for row, (metric, overlaps) in ROWS.items()
                 if self.with_camera or metric != "image"}

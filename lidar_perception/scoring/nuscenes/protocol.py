@@ -25,16 +25,16 @@ RANGES = {"car": 50.0, "truck": 50.0, "bus": 50.0, "trailer": 50.0, "constructio
 DISTANCES = (0.5, 1.0, 2.0, 4.0)    # of centres of a hit, metres
 ERROR_DISTANCE = 2.0                # of hits that errors are computed for
 RECALLS = np.linspace(0.0, 1.0, 101)
-FIRST_RECALL_INDEX = 11                   # of the first of RECALLS above 0.1
+FIRST_RECALL_INDEX = 11             # of the first of RECALLS above 0.1
 MIN_PRECISION = 0.1
-MAP_WEIGHT = 5                       # weight of mAP in NDS; each of ERRORS has weight 1
+MAP_WEIGHT = 5                      # of mAP in NDS; each of ERRORS has weight 1
 RACK_CLASSES = ("bicycle", "motorcycle")  # ignored inside a bicycle rack
 
 # translation m, scale 1 - IoU of the aligned boxes, orientation rad, velocity m/s, attribute
 # 1 - accuracy
 ERRORS = ("ate", "ase", "aoe", "ave", "aae")
 UNDEFINED = {"traffic_cone": ("aoe", "ave", "aae"), "barrier": ("ave", "aae")}
-SYMMETRIC_CLASSES = ("barrier",)           # front and rear are equal
+SYMMETRIC_CLASSES = ("barrier",)  # front and rear are equal
 
 
 def select_counted(boxes: GlobalBoxes, ego: np.ndarray, racks: GlobalBoxes) -> np.ndarray:
@@ -79,8 +79,7 @@ def score_class(name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: G
     """Score a class over the counted boxes of all frames.
 
     Args:
-        name: name of the class.
-        truth, found: labels (M) and detections (K).
+        truth, found: M labels and K detections.
         true_frames, found_frames: indices of their frames, (M,) ascending and (K,) int.
     """
     own, own_found = (boxes.class_ids == NAMES.index(name) for boxes in (truth, found))
@@ -109,27 +108,26 @@ def score_class(name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: G
 
 
 @njit(cache=True, nogil=True)
-def _match(centres, frames, true_centres, first, most):
+def _match(centres, frames, true_centres, first, max_distance):
     """Return the index (K,) int64 of the object that each detection hits, -1 without one.
 
     Detections are sorted by descending score; objects of frame f are first[f] .. first[f + 1].
     """
     indices, taken = np.full(len(centres), -1), np.zeros(len(true_centres), np.bool_)
     for i in range(len(centres)):
-        best, least = -1, np.inf
+        best, nearest = -1, np.inf
         for j in range(first[frames[i]], first[frames[i] + 1]):
             away = np.sqrt((centres[i, 0] - true_centres[j, 0]) ** 2
                            + (centres[i, 1] - true_centres[j, 1]) ** 2)
-            if not taken[j] and away < least:
-                best, least = j, away
-        if least < most:
+            if not taken[j] and away < nearest:
+                best, nearest = j, away
+        if nearest < max_distance:
             indices[i], taken[best] = best, True
     return indices
 
 
-def _interpolate_curves(
-    hit: np.ndarray, scores: np.ndarray, objects: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _interpolate_curves(hit: np.ndarray, scores: np.ndarray,
+                        objects: int) -> tuple[np.ndarray, np.ndarray]:
     """Interpolate precision and score at RECALLS, (101,) each, 0 at recall that is not reached.
 
     Detections (K,) are sorted by descending score.
@@ -159,9 +157,8 @@ def _average_error(values: np.ndarray, scores: np.ndarray, confidence: np.ndarra
     return float(curve[FIRST_RECALL_INDEX:last + 1].mean())
 
 
-def compute_errors(
-    truth: GlobalBoxes, found: GlobalBoxes, half_turns: bool
-) -> dict[str, np.ndarray]:
+def compute_errors(truth: GlobalBoxes, found: GlobalBoxes,
+                   half_turns: bool) -> dict[str, np.ndarray]:
     """Compute the ERRORS (H,) float64 of pairs of boxes.
 
     An error is NaN where the true velocity or attribute, or the detected velocity, is unknown. With
@@ -170,10 +167,10 @@ def compute_errors(
     shared = np.minimum(truth.sizes, found.sizes).prod(axis=1)
     union = truth.sizes.prod(axis=1) + found.sizes.prod(axis=1) - shared
     period = np.pi if half_turns else 2 * np.pi
-    turned = (truth.yaws - found.yaws + period / 2) % period - period / 2
+    rotation = (truth.yaws - found.yaws + period / 2) % period - period / 2
     differs = (truth.attributes != found.attributes).astype(float)
     return {"ate": np.hypot(*(truth.centres - found.centres)[:, :2].T), "ase": 1 - shared / union,
-            "aoe": np.abs(turned), "ave": np.hypot(*(truth.velocities - found.velocities).T),
+            "aoe": np.abs(rotation), "ave": np.hypot(*(truth.velocities - found.velocities).T),
             "aae": np.where(truth.attributes < 0, np.nan, differs)}
 
 
@@ -183,9 +180,9 @@ def summarize(scores: dict[str, ClassScores]) -> dict[str, float]:
     nds is nuScenes' detection score, the mean of mAP with weight MAP_WEIGHT and 1 - error (at least
     0) of each error.
     """
-    result = {"map": float(np.mean([s.mean_ap for s in scores.values()]))}
-    for error in ERRORS:
-        result[error] = float(np.nanmean([s.errors[error] for s in scores.values()]))
+    result = {"map": float(np.mean([s.mean_ap for s in scores.values()])),
+              **{error: float(np.nanmean([s.errors[error] for s in scores.values()]))
+                 for error in ERRORS}}
     parts = [max(0.0, 1.0 - result[error]) for error in ERRORS]
     result["nds"] = (MAP_WEIGHT * result["map"] + sum(parts)) / (MAP_WEIGHT + len(parts))
     return result

@@ -51,14 +51,9 @@ def select_boxes(frame: Frame, boxes: GlobalBoxes, ms: float | None = None,
     if labels is None:
         return KeyFrameResult(key.token, boxes, None, None, ms, problem)
     racks = labels.bicycle_racks()
-    return KeyFrameResult(
-        key.token,
-        boxes,
-        labels.boxes[select_counted(labels.boxes, key.ego, racks)],
-        boxes[select_counted(boxes, key.ego, racks)],
-        ms,
-        problem,
-    )
+    return KeyFrameResult(key.token, boxes,
+                          labels.boxes[select_counted(labels.boxes, key.ego, racks)],
+                          boxes[select_counted(boxes, key.ego, racks)], ms, problem)
 
 
 def measure_key_frames(open_: Callable[[], Detector], unlabelled: bool,
@@ -83,9 +78,8 @@ def measure_key_frames(open_: Callable[[], Detector], unlabelled: bool,
     return measure
 
 
-def measure_result_file(
-    path: Path, recording: Recording
-) -> Callable[[Frame], KeyFrameResult | None]:
+def measure_result_file(path: Path,
+                        recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
     """Read a result file of nuScenes' detection task.
 
     partial(measure_result_file, path) is a Start of scoring.run.

@@ -19,14 +19,10 @@ def print_nuscenes_report(content: dict, console: Console) -> None:
                        *(f"{d:g}m" for d in DISTANCES), "mAP", *(e.upper() for e in ERRORS),
                        "NDS", width=4)
     for name, row in content["classes"].items():
-        table.add_row(
-            name.replace("construction_vehicle", "constr. veh.").replace("_", " "),
-            str(row["objects"]),
-            *(f"{ap:.3g}" for ap in row["ap"].values()),
-            format_number(row["mean_ap"]),
-            *_errors(row),
-            style="" if name in DETECTED_NAMES else "dim",
-        )
+        table.add_row(name.replace("construction_vehicle", "constr. veh.").replace("_", " "),
+                      str(row["objects"]), *(f"{ap:.3g}" for ap in row["ap"].values()),
+                      format_number(row["mean_ap"]), *_errors(row),
+                      style="" if name in DETECTED_NAMES else "dim")
     table.add_section()
     for key, title in ("all", "all ten"), ("ours", "our three"):
         objects = sum(row["objects"] for name, row in content["classes"].items()

@@ -22,11 +22,9 @@ def print_cluster_scores(content: dict[str, Any], out: Console) -> None:
         row = rows["by_class"].get(name, {})
         table.add_row(name, *map(str, counts), _format_number(row.get("recall")),
                       _format_number(row.get("precision")))
-    table.caption = (
-        f"{_format_number(rows['accuracy'])} % of the clusters are of the class that the "
-        f"network says, {_format_number(rows['object_accuracy'])} % of the objects among "
-        "them."
-    )
+    table.caption = (f"{_format_number(rows['accuracy'])} % of the clusters, and "
+                     f"{_format_number(rows['object_accuracy'])} % of the objects among them, are "
+                     "classified correctly.")
     out.print(table)
     table = make_table("Points in the image, in percent", "", "accuracy", "precision", "recall",
                        "F1", "IoU")
@@ -39,9 +37,8 @@ def print_cluster_scores(content: dict[str, Any], out: Console) -> None:
     for name, row in points["by_class"].items():
         table.add_row(f"  {name}", "", *(_format_number(row[key]) for key in
                                          ("precision", "recall", "f1", "iou")))
-    table.add_row(
-        "paper C, KITTI", *(_format_number(value) for value in PAPER.values()), style="dim"
-    )
+    table.add_row("paper C, KITTI", *(_format_number(value) for value in PAPER.values()),
+                  style="dim")
     table.caption = "The paper does not define how points are counted."
     out.print(table)
     print_skipped(content["skipped"], out)

@@ -24,31 +24,22 @@ from lidar_perception.ground.segment import segment_ground
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, GroundTruth
 
-UNKNOWN = -1              # label of clusters and points that are not scored
-MIN_OBJECT_SHARE, MAX_BACKGROUND_SHARE = (
-    0.5,
-    0.15,
-)  # a cluster with this share of its points in a box is that object, with
-# less than the second it is background
-BOX_MARGIN = 0.05  # m: points so near to a box are taken for its own, as labels are rounded
-# These look like a class, and are none of it; or nobody knows what they are.
-IGNORED_CLASSES = [
-    row.name for row in TABLE if row.numbers is None and (row.looks_like or row.vehicle)
-]
-IGNORED_CLASSES.append(CLASSES[DONT_CARE])
-MIN_POINTS = 10         # clusters with fewer do not count
+UNKNOWN = -1  # label of clusters and points that are not scored
+MIN_OBJECT_SHARE = 0.5       # of its points in a box, for a cluster to be that object
+MAX_BACKGROUND_SHARE = 0.15  # of its points in any box, for a cluster to be background
+BOX_MARGIN = 0.05  # metres; labels are rounded, so points this near to a box belong to it
+# Classes that resemble a scored class, and DontCare
+IGNORED_CLASSES = [row.name for row in TABLE if row.numbers is None
+                   and (row.looks_like or row.vehicle)] + [CLASSES[DONT_CARE]]
+MIN_POINTS = 10  # clusters with fewer do not count
 
 
 def label_clusters(clusters: Clusters, boxes: np.ndarray, class_ids: np.ndarray,
                    classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Label clusters by the boxes that contain them.
-
-    A cluster is labelled by the box with the largest share of its points.
+    """Label K clusters by the box with the largest share of their points.
 
     Args:
-        clusters: K clusters.
-        boxes: (M, 7) labelled boxes.
-        class_ids: (M,) indices into CLASSES.
+        boxes, class_ids: (M, 7) labelled boxes, and (M,) indices into CLASSES.
         classes: names of the labels.
 
     Returns:
@@ -96,16 +87,14 @@ def mask_unlabelled(labels: np.ndarray, clusters: Clusters, unlabelled: np.ndarr
     unlabelled (P,) bool is a mask of the points of all clusters.
     """
     number = np.repeat(np.arange(len(clusters)), clusters.sizes)
-    share = np.bincount(number, unlabelled, minlength=len(clusters)) / np.maximum(
-        clusters.sizes, 1
-    )
+    share = np.bincount(number, unlabelled, minlength=len(clusters)) / np.maximum(clusters.sizes, 1)
     return np.where((labels == background) & (share >= 0.5), UNKNOWN, labels)
 
 
 def map_labels(class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
-    """Map class_ids (M,) into CLASSES to labels (M,) int64 into classes.
+    """Map class_ids (M,) to labels (M,) int64 into classes.
 
-    len(classes) is background, UNKNOWN a class that looks like one of classes but is not.
+    len(classes) is background; classes of IGNORED_CLASSES are UNKNOWN.
     """
     return np.array([classes.index(name) if name in classes else
                      UNKNOWN if name in IGNORED_CLASSES else len(classes)
@@ -118,11 +107,8 @@ def count_confusions(clusters: Clusters, labels: np.ndarray, predictions: Predic
     """Count the clusters and points of one frame by true and predicted class.
 
     Args:
-        clusters: the clusters.
-        labels: their true labels.
-        predictions: of the network.
-        point_truth: (N,) true labels of all points.
-        cluster_ids: (N,) cluster of each point, 0 for none.
+        labels: (K,) true labels of the clusters.
+        point_truth, cluster_ids: (N,) true label of each point, and its cluster, 0 for none.
         classes: names of the labels.
 
     Returns:
@@ -164,13 +150,11 @@ def measure_network(weights: Path, settings: Mapping[str, Any],
         ground = segment_ground(scan, params.ground)
         ids = cluster_obstacles(scan.xyz, ground, params.clustering)
         camera = frame.camera()
-        if camera is None:  # then all around is labelled
+        if camera is None:  # labels cover all directions
             indices, hidden = np.arange(len(scan)), lambda xyz: np.zeros(len(xyz), bool)
         else:
-            indices, hidden = (
-                np.flatnonzero(camera.in_view(scan.xyz)),
-                partial(find_unlabelled, truth, camera),
-            )
+            indices, hidden = (np.flatnonzero(camera.in_view(scan.xyz)),
+                               partial(find_unlabelled, truth, camera))
         seen, ids = scan.take(indices), ids[indices]
         made = make_clusters(seen, ids, ground=ground[indices])
         labels, _ = label_clusters(made, truth.boxes, truth.class_ids, config.classes)
@@ -214,13 +198,13 @@ class ClusterScores:
 def _compute_scores(confusion: np.ndarray, classes: Sequence[str]) -> dict[str, Any]:
     """Compute accuracy, and precision, recall, F1 and IoU by class and as their mean."""
     right = np.diag(confusion)
-    true, said = confusion.sum(axis=1), confusion.sum(axis=0)
+    true, predicted = confusion.sum(axis=1), confusion.sum(axis=0)
     rows = {}
     for i, name in enumerate(classes):
-        rows[name] = {"objects": int(true[i]), "precision": _to_percent(right[i], said[i]),
+        rows[name] = {"objects": int(true[i]), "precision": _to_percent(right[i], predicted[i]),
                       "recall": _to_percent(right[i], true[i]),
-                      "f1": _to_percent(2 * right[i], true[i] + said[i]),
-                      "iou": _to_percent(right[i], true[i] + said[i] - right[i])}
+                      "f1": _to_percent(2 * right[i], true[i] + predicted[i]),
+                      "iou": _to_percent(right[i], true[i] + predicted[i] - right[i])}
     found = [row for row in rows.values() if row["objects"]]
     mean = {key: float(np.mean([row[key] or 0.0 for row in found])) if found else None
             for key in ("precision", "recall", "f1", "iou")}

@@ -39,12 +39,9 @@ class SegmentationParams:
 
 @dataclass(frozen=True)
 class SegmentationResult:
-    """Results of one frame.
+    """Arguments of GroundReport.update and ClusterReport.update by method, for one frame.
 
-    Attributes:
-        ground: arguments of GroundReport.update by ground method.
-        clusters: arguments of ClusterReport.update by clustering method.
-        whole: True if there was no camera to crop to.
+    whole is True if there was no camera to crop to.
     """
 
     ground: dict[str, tuple] = field(default_factory=dict)
@@ -52,12 +49,9 @@ class SegmentationResult:
     whole: bool = False
 
 
-def measure_methods(
-    params: SegmentationParams,
-    grounds: tuple[str, ...],
-    clusterings: tuple[str, ...],
-    recording: Recording,
-) -> Callable[[Frame], SegmentationResult | None]:
+def measure_methods(params: SegmentationParams, grounds: tuple[str, ...],
+                    clusterings: tuple[str, ...],
+                    recording: Recording) -> Callable[[Frame], SegmentationResult | None]:
     """Run ground and clustering methods on every labelled frame.
 
     Ground is scored on labelled points. Clusters are scored on labelled instances or boxes; with

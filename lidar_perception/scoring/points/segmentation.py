@@ -28,10 +28,10 @@ PROTOCOLS = ("without vegetation", "with vegetation", "vegetation not ground")
 LOW_VEGETATION_Z = -1.3  # metres in the LiDAR frame of KITTI, 1.73 m above the road
 
 HIT_IOU = 0.5
-MIN_POINTS = 10      # objects with fewer points are ignored
-BOTTOM_MARGIN = 0.2  # metres; points below this above the bottom of a box may be road
-BOX_MARGIN = 0.2         # metres; a cluster is scored if most of it is in boxes enlarged by this
-MIN_PIECE_SHARE = 0.1          # of an object's points in a cluster that is a piece of it
+MIN_POINTS = 10        # objects with fewer points are ignored
+BOTTOM_MARGIN = 0.2    # metres above the bottom of a box; points below it may be road
+BOX_MARGIN = 0.2       # metres; a cluster is scored if most of it is in boxes enlarged by this
+MIN_PIECE_SHARE = 0.1  # of an object's points in a cluster that is a piece of it
 RANGE_NAMES = ("0-15", "15-30", "30-45", "45+")
 RANGE_LIMITS = np.array([15.0, 30.0, 45.0])
 
@@ -55,14 +55,14 @@ def select_true_ground(semantic: np.ndarray, z: np.ndarray,
 
 
 def count_ground(found: np.ndarray, ground: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """Count the prediction found (N,) bool as (4,) int64 [tp fp fn tn]."""
+    """Count the predicted ground, found (N,) bool, as (4,) int64 [tp fp fn tn]."""
     case = np.where(ground, np.where(found, 0, 2), np.where(found, 1, 3))
     return np.bincount(case.compress(counted), minlength=4)
 
 
 def count_by_protocol(found: np.ndarray, semantic: np.ndarray,
                       z: np.ndarray) -> dict[str, np.ndarray]:
-    """Count the prediction found (N,) bool under each protocol; see select_true_ground."""
+    """Count the predicted ground, found (N,) bool, by protocol; see select_true_ground."""
     return {name: count_ground(found, *select_true_ground(semantic, z, name)) for name in PROTOCOLS}
 
 

@@ -43,12 +43,9 @@ def _print_ground(reports: dict, console: Console) -> None:
         table.add_row(titles[protocol], style="bold")
         for name, report in reports.items():
             row = report["protocols"][protocol]
-            table.add_row(
-                f"  {name}",
-                *format_percent(row, "precision", "recall", "f1", "accuracy"),
-                *format_counts(row, "tp", "fp", "fn"),
-                _format_ms(report),
-            )
+            table.add_row(f"  {name}",
+                          *format_percent(row, "precision", "recall", "f1", "accuracy"),
+                          *format_counts(row, "tp", "fp", "fn"), _format_ms(report))
         if protocol in PUBLISHED:
             table.add_row("  Patchwork++ published", *(f"{v:.1f}" for v in PUBLISHED[protocol]),
                           style="dim")
@@ -112,14 +109,9 @@ def draw_ground(path: Path, name: str, frame: PointCloud, semantic: np.ndarray,
                 (counted & ~true & ground, "#d55e00", "found, but not ground", 1.2)):
             axes.scatter(-frame.xyz[mask, 1], frame.xyz[mask, 0], s=size, c=color, linewidths=0,
                          label=f"{label} ({int(mask.sum())})")
-        axes.set(
-            xlim=(-MAX_DRAWN_RANGE, MAX_DRAWN_RANGE),
-            ylim=(-MAX_DRAWN_RANGE, MAX_DRAWN_RANGE),
-            aspect="equal",
-            xlabel="right [m]",
-            ylabel="forward [m]",
-            title=f"{method}, scan {name}",
-        )
+        axes.set(xlim=(-MAX_DRAWN_RANGE, MAX_DRAWN_RANGE), ylim=(-MAX_DRAWN_RANGE, MAX_DRAWN_RANGE),
+                 aspect="equal", xlabel="right [m]", ylabel="forward [m]",
+                 title=f"{method}, scan {name}")
         for handle in axes.legend(loc="upper right", framealpha=0.9).legend_handles:
             handle.set_sizes([30])
     save_picture(path, figure)

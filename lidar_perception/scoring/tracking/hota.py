@@ -5,7 +5,7 @@ Counts are added over sequences; scores are computed from the sums.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -35,8 +35,7 @@ class HotaCounts:
     located: np.ndarray = field(default_factory=_zeros)
 
     def __add__(self, other: HotaCounts) -> HotaCounts:
-        return HotaCounts(*(getattr(self, name) + getattr(other, name)
-                            for name in ("tp", "fn", "fp", "associated", "located")))
+        return HotaCounts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
     def scores(self) -> dict[str, float]:
         """Return HOTA, DetA, AssA, DetRe, DetPr and LocA, 0..1, averaged over ALPHAS.
@@ -58,24 +57,24 @@ def count_hota(frames: list[Pairs]) -> HotaCounts:
     track_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.track_ids for f in frames)]))
     indices = [(np.searchsorted(true_ids, f.true_ids), np.searchsorted(track_ids, f.track_ids))
                for f in frames]
-    concatenate = np.zeros((len(true_ids), len(track_ids)))
+    together = np.zeros((len(true_ids), len(track_ids)))  # summed share of each pair
     true_count, track_count = np.zeros((len(true_ids), 1)), np.zeros((1, len(track_ids)))
     for f, (i, j) in zip(frames, indices):
         s = f.similarity
         either = s.sum(axis=0) + s.sum(axis=1)[:, None] - s
-        concatenate[np.ix_(i, j)] += np.divide(s, either, out=np.zeros_like(s), where=either > EPS)
+        together[np.ix_(i, j)] += np.divide(s, either, out=np.zeros_like(s), where=either > EPS)
         true_count[i] += 1
         track_count[0, j] += 1
-    alignment = concatenate / np.maximum(true_count + track_count - concatenate, EPS)
+    alignment = together / np.maximum(true_count + track_count - together, EPS)
     matches = np.zeros((len(ALPHAS), len(true_ids), len(track_ids)))
     located = _zeros()
     for f, (i, j) in zip(frames, indices):
         # pairs of similarity 0 can be assigned too; they are below every alpha
         rows, columns = find_best_pairs(alignment[np.ix_(i, j)] * f.similarity)
         alike = f.similarity[rows, columns]
-        good = alike >= ALPHAS[:, None] - EPS
-        matches[:, i[rows], j[columns]] += good
-        located += (good * alike).sum(axis=1)
+        is_match = alike >= ALPHAS[:, None] - EPS
+        matches[:, i[rows], j[columns]] += is_match
+        located += (is_match * alike).sum(axis=1)
     tp = matches.sum(axis=(1, 2))
     either = np.maximum(1.0, true_count + track_count - matches)
     return HotaCounts(tp, true_count.sum() - tp, track_count.sum() - tp,

@@ -16,15 +16,14 @@ from lidar_perception.camera import Calibration
 from lidar_perception.classes import DETECTED
 from lidar_perception.geometry import iou_3d
 from lidar_perception.scoring.kitti.camera_objects import CameraObjects, to_camera_objects
-from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
+from lidar_perception.scoring.kitti.protocol import EPS, NEIGHBOURS, compute_image_iou
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 
 MAX_OCCLUSION, MAX_TRUNCATION = 2, 0  # levels of the tracking layout
-MIN_HEIGHT = 25.0    # pixels
-MAX_REGION_SHARE = 0.5      # of a box inside a DontCare region
-MAX_CENTRE_DISTANCE = 2.0  # metres, where the similarity of centres is 0
-MIN_SIMILARITY = 0.5          # of a match in CLEAR MOT, and with an ignored label
-EPS = np.finfo(float).eps  # tolerance of comparisons in TrackEval
+MIN_HEIGHT = 25.0          # pixels
+MAX_REGION_SHARE = 0.5     # of a box inside a DontCare region
+MAX_CENTRE_DISTANCE = 2.0  # metres; farther centres have the similarity 0
+MIN_SIMILARITY = 0.5       # of a match in CLEAR MOT, and with an ignored label
 
 SIMILARITIES = ("centres", "3d", "image")
 
@@ -81,14 +80,11 @@ def make_pairs(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration
     ignored = np.array([extra.get("occluded", 0) > MAX_OCCLUSION or round(
         extra.get("truncated", 0)) > MAX_TRUNCATION for extra in truth.extras], bool)
     ignored |= true_objects.pixels_high == 0
-    excused = (objects.pixels_high <= MIN_HEIGHT + EPS) | _find_in_regions(
-        objects.image_boxes, true.regions)
-    return {
-        name: _make_class_pairs(
-            name, true_objects, objects, true_ids, track_ids, ignored, excused, similarity
-        )
-        for name in DETECTED
-    }
+    in_region = compute_image_iou(objects.image_boxes, true.regions, of_first=True)
+    excused = ((objects.pixels_high <= MIN_HEIGHT + EPS)
+               | (in_region > MAX_REGION_SHARE + EPS).any(axis=1))
+    return {name: _make_class_pairs(name, true_objects, objects, true_ids, track_ids, ignored,
+                                    excused, similarity) for name in DETECTED}
 
 
 def read_track_ids(objects: GroundTruth, what: str) -> np.ndarray:
@@ -123,35 +119,16 @@ def _make_class_pairs(name: str, true: CameraObjects, found: CameraObjects, true
                  tracks.scores, excused[columns], alike, overlap)
 
 
-def compute_image_iou(boxes: np.ndarray, others: np.ndarray, of_first: bool = False) -> np.ndarray:
-    """Compute the IoU (K, M) of 2D boxes (K, 4) and (M, 4) [left top right bottom].
-
-    With of_first, compute the share of each of boxes that is inside others. 0 for a box without
-    area.
-    """
-    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
-    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
-    shared = np.prod(np.maximum(high - low, 0.0), axis=2)
-    areas, other_areas = (np.prod(b[:, 2:] - b[:, :2], axis=1) for b in (boxes, others))
-    whole = areas[:, None] + (0.0 if of_first else other_areas - shared)
-    return np.divide(shared, whole, out=np.zeros_like(shared), where=whole > EPS)
-
-
-def _find_in_regions(boxes: np.ndarray, regions: np.ndarray) -> np.ndarray:
-    return np.any(compute_image_iou(boxes, regions, of_first=True) > MAX_REGION_SHARE + EPS, axis=1)
-
-
 def drop_ignored(pairs: Pairs) -> Pairs:
     """Return the pairs that HOTA and CLEAR MOT count.
 
     Ignored labels, tracks matched to them, and excused tracks that match nothing are dropped.
     """
-    rows, columns = find_best_pairs(
-        np.where(pairs.similarity < MIN_SIMILARITY - EPS, 0.0, pairs.similarity)
-    )
-    gone = pairs.excused.copy()
-    gone[columns] = pairs.ignored[rows]
-    labels, tracks = np.flatnonzero(~pairs.ignored), np.flatnonzero(~gone)
+    rows, columns = find_best_pairs(np.where(pairs.similarity < MIN_SIMILARITY - EPS, 0.0,
+                                             pairs.similarity))
+    dropped = pairs.excused.copy()
+    dropped[columns] = pairs.ignored[rows]
+    labels, tracks = np.flatnonzero(~pairs.ignored), np.flatnonzero(~dropped)
     both = np.ix_(labels, tracks)
     return replace(pairs, true_ids=pairs.true_ids[labels], ignored=pairs.ignored[labels],
                    track_ids=pairs.track_ids[tracks], scores=pairs.scores[tracks],
@@ -165,5 +142,5 @@ def find_best_pairs(gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Pairs without gain are dropped.
     """
     rows, columns = linear_sum_assignment(gain, maximize=True)
-    good = gain[rows, columns] > EPS
-    return rows[good], columns[good]
+    kept = gain[rows, columns] > EPS
+    return rows[kept], columns[kept]

@@ -73,16 +73,9 @@ def _measure_tracking(open_: Callable[[], Detector], params: TrackingParams, ego
         tracks = tracker(frame, detector(frame.load()).detections)
         if truth is None:
             return None
-        return replace(
-            observe(
-                tracker.drive,
-                frame.index,
-                truth,
-                to_tracked_labels(tracks.ids, tracks.detections),
-                frame.calibration(),
-            ),
-            has_pose=tracker.has_pose,
-        )
+        found = to_tracked_labels(tracks.ids, tracks.detections)
+        return replace(observe(tracker.drive, frame.index, truth, found, frame.calibration()),
+                       has_pose=tracker.has_pose)
     return measure
 
 
@@ -108,18 +101,11 @@ class TrackingReport:
         names = sorted({sequence for sequence, _ in self.frames})
         ordered = {name: [self.frames[key] for key in sorted(self.frames) if key[0] == name]
                    for name in names}
-        return {
-            "frames": len(self.frames),
-            "without_pose": len(self.without_pose),
-            "sequences": len(names),
-            "skipped": self.skipped,
-            "classes": {
-                name: _score_class(
-                    [[frame[name] for frame in frames] for frames in ordered.values()]
-                )
-                for name in DETECTED
-            },
-        }
+        return {"frames": len(self.frames), "without_pose": len(self.without_pose),
+                "sequences": len(names), "skipped": self.skipped,
+                "classes": {name: _score_class([[frame[name] for frame in frames]
+                                                for frames in ordered.values()])
+                            for name in DETECTED}}
 
 
 def _score_class(sequences: list[list[Pairs]]) -> dict | None:
@@ -129,23 +115,14 @@ def _score_class(sequences: list[list[Pairs]]) -> dict | None:
         hota, clear = hota + count_hota(frames), clear + count_clear(frames)
     if clear.tp + clear.fn + clear.fp == 0:
         return None
-    return {
-        **hota.scores(),
-        **clear.scores(),
-        **score_over_recall(sequences),
-        "labels": clear.tp + clear.fn,
-        "boxes": clear.tp + clear.fp,
-        "true_tracks": _count_tracks(counted, "true_ids"),
-        "tracks": _count_tracks(counted, "track_ids"),
-        "hits": clear.tp,
-        "misses": clear.fn,
-        "false": clear.fp,
-        "switches": clear.switches,
-        "fragments": clear.fragments,
-        "mostly_tracked": clear.mostly_tracked,
-        "partly_tracked": clear.partly_tracked,
-        "mostly_lost": clear.mostly_lost,
-    }
+    return {**hota.scores(), **clear.scores(), **score_over_recall(sequences),
+            "labels": clear.tp + clear.fn, "boxes": clear.tp + clear.fp,
+            "true_tracks": _count_tracks(counted, "true_ids"),
+            "tracks": _count_tracks(counted, "track_ids"),
+            "hits": clear.tp, "misses": clear.fn, "false": clear.fp,
+            "switches": clear.switches, "fragments": clear.fragments,
+            "mostly_tracked": clear.mostly_tracked, "partly_tracked": clear.partly_tracked,
+            "mostly_lost": clear.mostly_lost}
 
 
 def _count_tracks(sequences: list[list[Pairs]], name: str) -> int:

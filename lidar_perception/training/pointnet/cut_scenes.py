@@ -28,8 +28,8 @@ from lidar_perception.detectors.pointpillars.params import DetectorParams, Point
 from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.intensity import normalize_intensity
+from lidar_perception.scoring.detections import draw_subset
 from lidar_perception.scoring.points.clusters import UNKNOWN, label_clusters
-from lidar_perception.scoring.thinning import draw_subset
 from lidar_perception.training.augment import TrainingScene, raise_scene
 from lidar_perception.training.cache import cache_path, file_fingerprint, load_or_make
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, PointCloud
