@@ -14,10 +14,9 @@ from scipy.spatial import cKDTree
 
 from experiments.realism.roughness import compute_roughness
 from lidar_perception.camera import Camera
-from lidar_perception.candidates.boxes import select_by_height
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment_cloud
-from lidar_perception.candidates.refine import STAGES
+from lidar_perception.candidates.refine import STAGES, select_by_height
 from lidar_perception.classes import CAR, DETECTED
 from lidar_perception.geometry import box_corners, horizontal_range, points_in_box, to_box_frame
 from lidar_perception.ground.params import GroundParams

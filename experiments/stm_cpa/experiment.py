@@ -11,12 +11,15 @@ from experiments.framework.experiment import Experiment
 from experiments.stm_cpa.frames import load_labelled_frame, make_nearest_seed
 from experiments.stm_cpa.params import StmCpaParams
 from experiments.stm_cpa.tables import make_sections
-from lidar_perception.candidates.boxes import select_by_height, snap_to_ground
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.refine import STAGES, Candidates, refine_clusters
+from lidar_perception.candidates.refine import STAGES, Candidates, refine_clusters, select_by_height
 from lidar_perception.candidates.seeds import Seed
-from lidar_perception.candidates.segmented_cloud import SegmentedCloud, fit_ground_plane
+from lidar_perception.candidates.segmented_cloud import (
+    SegmentedCloud,
+    fit_ground_plane,
+    snap_to_ground,
+)
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.data.frame import Frame

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib.resources import files
 from typing import Any
@@ -16,7 +17,6 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from lidar_perception.candidates.curves import compute_log_odds
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.silhouette import (
     COLUMNS,
@@ -103,6 +103,22 @@ def compute_confidence(shape: dict[str, np.ndarray], similarity: np.ndarray | No
         features.update(similarity=similarity, height_difference_m=np.abs(height_difference))
     model = _load_models()["shape" if similarity is None else "seed"]
     return 1.0 / (1.0 + np.exp(-compute_log_odds(model, features)))
+
+
+def compute_log_odds(model: Mapping[str, Any], features: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Compute the log-odds (K,) float64 of K objects.
+
+    Args:
+        model: `bias`, and `curves` with the `knots` and `values` of each feature. A curve is
+            constant beyond its first and last knot. A NaN feature adds the curve's `unknown`, by
+            default 0.
+        features: arrays (K,) by name.
+    """
+    odds = np.full(len(next(iter(features.values()))), float(model["bias"]))
+    for name, curve in model["curves"].items():
+        values = np.interp(features[name], curve["knots"], curve["values"])
+        odds += np.where(np.isnan(features[name]), curve.get("unknown", 0.0), values)
+    return odds
 
 
 @functools.cache

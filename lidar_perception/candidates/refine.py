@@ -8,9 +8,8 @@ from time import perf_counter
 
 import numpy as np
 
-from lidar_perception.candidates.boxes import select_by_height
 from lidar_perception.candidates.confidence import compute_confidence, compute_shape_features
-from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.params import HeightParams, PipelineParams
 from lidar_perception.candidates.seeds import Seed, find_seed_cluster
 from lidar_perception.candidates.silhouette import (
     compute_cpa_scales,
@@ -41,6 +40,11 @@ class Candidates:
     @staticmethod
     def none() -> Candidates:
         return Candidates(Detections.none(), Detections.none(), Detections.none())
+
+
+def select_by_height(boxes: np.ndarray, seed_height: float, params: HeightParams) -> np.ndarray:
+    """Return (K,) bool: |h - h_seed| <= tolerance (Section 3.5)."""
+    return np.abs(boxes[:, 5] - seed_height) <= params.tolerance
 
 
 def refine_clusters(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray,

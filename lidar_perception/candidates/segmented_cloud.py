@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lidar_perception.camera import Camera
-from lidar_perception.candidates.boxes import snap_to_ground
 from lidar_perception.clustering.params import BoxParams
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.ground.params import ThresholdParams
@@ -41,6 +40,22 @@ def fit_grounded_boxes(xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndar
     """Fit boxes (K, 7) to clusters 1..K, down to the plane through the ground points."""
     plane = fit_ground_plane(xyz.compress(ground, axis=0), params)
     return snap_to_ground(fit_boxes(xyz, cluster_ids, params.shape), plane)
+
+
+def snap_to_ground(boxes: np.ndarray, plane: np.ndarray | None) -> np.ndarray:
+    """Return boxes (K, 7) whose bottom is lowered to the plane under their centre (Section 3.4).
+
+    A box that already reaches below the plane is not changed. Without a plane no box is.
+    """
+    snapped = boxes.copy()
+    if plane is None:
+        return snapped
+    ground = boxes[:, :2].astype(np.float64) @ plane[:2] + plane[2]
+    top = boxes[:, 2] + boxes[:, 5] / 2
+    bottom = np.minimum(boxes[:, 2] - boxes[:, 5] / 2, ground)
+    snapped[:, 2] = (top + bottom) / 2
+    snapped[:, 5] = top - bottom
+    return snapped
 
 
 def fit_ground_plane(ground: np.ndarray, params: BoxParams) -> np.ndarray | None:

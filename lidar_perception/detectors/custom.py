@@ -20,7 +20,7 @@ import numpy as np
 from lidar_perception.classes import DETECTED
 from lidar_perception.detectors.contract import Cloud, DetectionResult, Detector, accept
 from lidar_perception.detectors.params import ScoreParams
-from lidar_perception.ground.params import SensorPoseParams
+from lidar_perception.ground.params import SensorPoseParams, set_sensor_height
 from lidar_perception.param_fields import Params
 from lidar_perception.robot.params import CropParams
 from lidar_perception.types import (
@@ -35,7 +35,7 @@ from lidar_perception.types import (
 
 ENTRY_POINTS = "lidar_perception.detectors"  # group of entry points: NAME = "module:Class"
 REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
-ARGUMENTS = "sensor_height", "device", "range"  # of a class, each passes on if the class takes it
+ARGUMENTS = "sensor_height", "device", "range"  # passed to a class that takes them
 
 
 @dataclass(frozen=True)
@@ -102,9 +102,7 @@ class CustomDetector:
 
     def with_sensor_height(self, height: float) -> CustomDetector:
         """Return this detector for a sensor mounted `height` metres above the ground."""
-        pose = replace(self.params.ground.sensor_pose, height=height)
-        return self.with_params(replace(
-            self.params, ground=replace(self.params.ground, sensor_pose=pose)))
+        return self.with_params(set_sensor_height(self.params, height))
 
     def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> DetectionResult:
@@ -162,7 +160,7 @@ def load_custom_detector(reference: str, device: str = "auto", range: str = "aut
 
     Args:
         reference: "module:Class". The module is on Python's path or in the current folder.
-        device, range: passes on if the class takes an argument of that name, as is the
+        device, range: passed on if the class takes an argument of that name, as is the
             sensor_height of the parameters, in metres.
         params, group: see CustomDetector. Default: CustomDetectorParams.
 

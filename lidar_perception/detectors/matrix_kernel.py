@@ -155,7 +155,7 @@ def multiply(rows, weights, bias, floor):
 
 
 def pack_weights(weights: np.ndarray) -> np.ndarray:
-    """Return weights (O, I, taps) in the memory order of tiles, pad_channels with zeros:
+    """Return weights (O, I, taps) in the memory order of tiles, padded with zeros:
     (blocks, taps, channels, BLOCK) float32."""
     out, channels, taps = weights.shape
     blocks = -(-out // BLOCK)
@@ -170,7 +170,7 @@ def pad_channels(channels: int) -> int:
 
 
 def pad_bias(bias: np.ndarray | None, width: int) -> np.ndarray:
-    """Return a bias (O,) or None as (width,) float32, pad_channels with zeros."""
+    """Return a bias (O,) or None as (width,) float32, padded with zeros."""
     filled = np.zeros(width, np.float32)
     if bias is not None:
         filled[:len(bias)] = bias

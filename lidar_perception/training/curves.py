@@ -1,4 +1,4 @@
-"""Fitting of additive models of log-odds, as candidates/curves.py reads them, to samples."""
+"""Fitting of additive models of log-odds, as candidates/confidence.py reads them, to samples."""
 
 from __future__ import annotations
 

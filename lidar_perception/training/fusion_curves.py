@@ -1,7 +1,7 @@
 """Fitting of the fused detector's curves to simulated scans of a sensor.
 
 The curves turn the evidence of PointPillars, silhouettes and the PointNet into one probability, see
-detectors/fused/model.py.
+detectors/fused/evidence.py.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from lidar_perception.classes import CAR, DETECTED
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import NETWORKS, Header
 from lidar_perception.detectors.fused.detector import FusedDetector, Proposals, load_fused_detector
-from lidar_perception.detectors.fused.evidence import Evidence
+from lidar_perception.detectors.fused.evidence import Evidence, compute_probabilities
 from lidar_perception.detectors.fused.fusion import KNOTS, Models, load_shipped_models, write_fusion
-from lidar_perception.detectors.fused.model import compute_probabilities
 from lidar_perception.detectors.fused.params import FusedDetectorParams, FusedParams
 from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.geometry import bev_iou, centre_distances

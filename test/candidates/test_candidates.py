@@ -9,17 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
 
-from lidar_perception.candidates.boxes import select_by_height, snap_to_ground
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.params import HeightParams, PipelineParams, SeedParams, StmParams
 from lidar_perception.candidates.pipeline import find_candidates, refine_segmented, segment_cloud
-from lidar_perception.candidates.refine import refine_clusters
+from lidar_perception.candidates.refine import refine_clusters, select_by_height
 from lidar_perception.candidates.seed_sources import (
     make_click_source,
     make_fixed_source,
     make_truth_source,
 )
 from lidar_perception.candidates.seeds import Seed, seed_from_points
+from lidar_perception.candidates.segmented_cloud import snap_to_ground
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.data.open import open_recording
 from lidar_perception.groups import group_points

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from lidar_perception.detectors.checkpoint import require_same_config
 from lidar_perception.detectors.config_json import parse_config
-from lidar_perception.detectors.pointpillars.box_coder import decode
+from lidar_perception.detectors.pointpillars.anchors import decode
 from lidar_perception.detectors.pointpillars.config import (
     SIZES,
     VERSIONS,

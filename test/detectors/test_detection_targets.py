@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.detectors.nms import rotated_nms
-from lidar_perception.detectors.pointpillars.box_coder import decode
+from lidar_perception.detectors.pointpillars.anchors import decode
 from lidar_perception.detectors.pointpillars.config import ANCHORS
 from lidar_perception.detectors.pointpillars.losses import detection_loss
 from lidar_perception.detectors.pointpillars.network import Outputs

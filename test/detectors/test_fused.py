@@ -30,9 +30,13 @@ from lidar_perception.detectors.fused.detector import (
     load_fused_detector,
     remove_duplicates,
 )
-from lidar_perception.detectors.fused.evidence import MIN_PROBABILITY, to_log_odds
+from lidar_perception.detectors.fused.evidence import (
+    MIN_PROBABILITY,
+    compute_max_probabilities,
+    compute_probabilities,
+    to_log_odds,
+)
 from lidar_perception.detectors.fused.fusion import KNOTS, load_shipped_models
-from lidar_perception.detectors.fused.model import compute_max_probabilities, compute_probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.normalized_view import (
     NormalizedView,

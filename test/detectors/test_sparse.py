@@ -12,7 +12,7 @@ import torch
 from detection_samples import lively, make_detector, random_detector, same, tiny
 
 from lidar_perception.data.open import open_recording
-from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.layer_weights import to_arrays
 from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.open import open_detector
@@ -171,30 +171,28 @@ def test_weights_that_are_no_numbers_are_reported(layer):
     config = tiny("v4")
     network = lively(config)
     network.get_parameter(layer).fill_(torch.nan)
-    detector = make_detector(TorchNetwork(network, engine="sparse"), Header(config))
+    detector = make_detector(sparse_network(network), Header(config))
     rng = np.random.default_rng(0)
     cloud = rng.uniform([2, -3, -1, 0], [6, 3, 0, 1], (200, 4)).astype(np.float32)
     found = detector(cloud, ground=np.zeros(200, bool), cluster_ids=np.zeros(200, int))
     assert len(found.detections) == 0 and found.problem
 
 
-def test_networks_that_torch_must_run(monkeypatch):
-    for config, words in [(tiny("v0"), "ground"), (tiny("v3"), "ground"),
-                          (tiny("v1", fusion="concat"), "neck"),
-                          (tiny("v1", neck="deconv"), "neck"),
-                          (tiny("v1", max_points=4, zero_row=True), "rows of zeros")]:
-        network = lively(config)
-        assert words in sparse.find_unsupported_part(network.pillar_net.config)
-        assert TorchNetwork(network, engine="auto").sparse is None
-        with pytest.raises(InputError, match=f"{words}.*; choose the engine auto or torch"):
-            TorchNetwork(network, engine="sparse")
-    network = lively(tiny("v4"))
-    assert TorchNetwork(network).sparse is None and TorchNetwork(network, engine="auto").sparse
-    with pytest.raises(InputError, match="16 bits"):
-        TorchNetwork(network, amp="bf16", engine="sparse")
-    monkeypatch.setattr(sparse, "LANES", 0)
-    assert "AVX2" in sparse.find_unsupported_part(network.pillar_net.config)
-    assert TorchNetwork(network, engine="auto").sparse is None
+@pytest.mark.parametrize("config, settings, words", [
+    (tiny("v0"), {}, "ground"), (tiny("v3"), {}, "ground"),
+    (tiny("v1", fusion="concat"), {}, "neck"), (tiny("v1", neck="deconv"), {}, "neck"),
+    (tiny("v1", max_points=4, zero_row=True), {}, "rows of zeros"),
+    (tiny("v4"), {"pointpillars.amp": "bf16"}, "16 bits"), (tiny("v4"), {}, "AVX2")])
+def test_networks_that_torch_must_run(config, settings, words, tmp_path, monkeypatch):
+    path = tmp_path / "a.safetensors"
+    save_checkpoint(path, lively(config), Header(config))
+    if words == "AVX2":
+        monkeypatch.setattr(sparse, "LANES", 0)
+    settings = {**settings, "pointpillars.warm_up": False}
+    detector = open_detector(path, "cpu", settings=settings)
+    assert isinstance(detector.proposer.network, TorchNetwork)
+    with pytest.raises(InputError, match=f"{words}.*; choose the engine auto or torch"):
+        open_detector(path, "cpu", settings={**settings, "pointpillars.engine": "sparse"})
 
 
 @pytest.mark.parametrize("weights", ["fused", "pointpillars"])
@@ -242,8 +240,7 @@ def test_detector_of_random_weights_equals_torch(version):
     detector = random_detector(version)
     detector.params = with_values(detector.params, {"pointpillars.nms.candidates": 5000})
     header = detector.proposer.header
-    other = make_detector(TorchNetwork(lively(header.config), engine="sparse"), header,
-                          detector.params)
+    other = make_detector(sparse_network(lively(header.config)), header, detector.params)
     rng = np.random.default_rng(3)
     cloud = rng.uniform([0, -5, -1.5, 0], [10, 5, 0.5, 1], (4000, 4)).astype(np.float32)
     columns = dict(ground=np.zeros(4000, bool), cluster_ids=rng.integers(0, 9, 4000))
@@ -255,7 +252,7 @@ def test_detector_of_random_weights_equals_torch(version):
 def test_a_cloud_without_a_pillar_detects_nothing():
     detector = random_detector("v4")
     proposer, config = detector.proposer, detector.proposer.config
-    proposer.network = TorchNetwork(lively(config), engine="sparse")
+    proposer.network = sparse_network(lively(config))
     broken = NetworkInput(np.full((10, 4), np.nan, np.float32),
                           np.zeros((3, *config.grid), np.uint8))
     _, predictions = proposer._predict({False: broken})

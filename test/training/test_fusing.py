@@ -20,6 +20,7 @@ from lidar_perception.classes import CAR, DETECTED
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import read_header, save_header
 from lidar_perception.detectors.fused.detector import FusedDetector, Proposals, load_fused_detector
+from lidar_perception.detectors.fused.evidence import compute_probabilities
 from lidar_perception.detectors.fused.fusion import (
     KNOTS,
     PACKAGE,
@@ -29,7 +30,6 @@ from lidar_perception.detectors.fused.fusion import (
     weights_file,
     write_fusion,
 )
-from lidar_perception.detectors.fused.model import compute_probabilities
 from lidar_perception.detectors.fused.params import FusedParams
 from lidar_perception.detectors.open import check_weights, open_detector
 from lidar_perception.detectors.pointnet.params import PointNetParams

@@ -20,6 +20,9 @@ from lidar_perception.detectors.boxes import move_cars_to_points, move_to_ground
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.fused.evidence import (
     Evidence,
+    compute_max_probabilities,
+    compute_probabilities,
+    compute_source_probabilities,
     find_silhouette_confidence,
     to_log_odds,
 )
@@ -30,11 +33,6 @@ from lidar_perception.detectors.fused.fusion import (
     find_fusion,
     load_shipped_models,
     read_fusion,
-)
-from lidar_perception.detectors.fused.model import (
-    compute_max_probabilities,
-    compute_probabilities,
-    compute_source_probabilities,
 )
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.nms import keep_first, rotated_nms
@@ -55,7 +53,6 @@ from lidar_perception.detectors.pointpillars.proposer import PointPillarsPropose
 from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.geometry import bev_iou, centre_distances
 from lidar_perception.ground.surface import GroundSurface, fit_ground_surface
-from lidar_perception.intensity import has_usable_intensity
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, PointCloud
 
 MAX_RELIEF_M = 2.0  # height of hills, and depth of hollows, around the sensor
@@ -89,8 +86,8 @@ class FusedDetector(NetworkDetector):
         proposer, classifier: the networks. The curves of `models` were fitted to the proposer's
             raw scores.
         models: curves that turn evidence into probabilities; None: the shipped ones.
-        load_blind: loads the detector, of a range, for clouds without usable intensity; None: this
-            one detects in them, too.
+        load_blind: load_blind(range) returns the detector for clouds without usable intensity;
+            None: this one detects in them, too.
     """
 
     group = "fused"
@@ -124,21 +121,35 @@ class FusedDetector(NetworkDetector):
 
     def detect(self, frame: PointCloud, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> DetectionResult:
-        if self.load_blind is not None and not (self.settings.use_intensity
-                                                and has_usable_intensity(frame.intensity)):
+        begin = perf_counter()
+        wide = self._make_view(frame)
+        if self.load_blind is not None and wide.frame.intensity is None:
             return self.load_blind(self.range).with_params(self.params).detect(frame, ground,
                                                                                cluster_ids)
-        proposals = self.propose(frame, ground, cluster_ids, self.settings.scores)
+        preprocess = perf_counter() - begin
+        proposals = self._propose(wide, ground, cluster_ids, self.settings.scores)
         begin = perf_counter()
         detections, best = self.decide(proposals)
         detections = restore_detections(detections, self.params.ground.sensor_pose)
-        timings = {**proposals.timings, STEPS[-1]: (perf_counter() - begin) * 1e3}
+        timings = {STEPS[0]: preprocess * 1e3, **proposals.timings,
+                   STEPS[-1]: (perf_counter() - begin) * 1e3}
         return DetectionResult(detections, timings, proposals.problem or self.fallback, best)
 
-    def propose(self, frame: PointCloud, ground: np.ndarray | None = None,
-                cluster_ids: np.ndarray | None = None,
-                min_scores: ScoreParams = ScoreParams.for_all_classes(0.0)) -> Proposals:
-        """Return the proposals for a cropped frame with the evidence of all sources.
+    def _make_view(self, frame: PointCloud) -> NormalizedView:
+        """Return the points in the range of the network, and up to MAX_RELIEF_M above or below."""
+        config, relief = self.proposer.config, np.array([0, 0, MAX_RELIEF_M])
+        return NormalizedView.of(frame, self.params.ground.sensor_pose, tuple(config.low - relief),
+                                 tuple(config.high + relief), self.settings.use_intensity)
+
+    def propose(self, frame: PointCloud) -> Proposals:
+        """Return the proposals for a cropped frame, whatever their score, with the evidence of all
+        sources."""
+        return self._propose(self._make_view(frame))
+
+    def _propose(self, wide: NormalizedView, ground: np.ndarray | None = None,
+                 cluster_ids: np.ndarray | None = None,
+                 min_scores: ScoreParams = ScoreParams.for_all_classes(0.0)) -> Proposals:
+        """Return the proposals for the result of _make_view() with the evidence of all sources.
 
         Args:
             min_scores: the classifier, which takes most time, skips proposals that cannot reach
@@ -146,15 +157,11 @@ class FusedDetector(NetworkDetector):
         """
         times = [perf_counter()]
         settings, params, config = self.settings, self.params, self.proposer.config
-        low, high, relief = config.low, config.high, np.array([0, 0, MAX_RELIEF_M])
-        wide = NormalizedView.of(frame, params.ground.sensor_pose, tuple(low - relief),
-                                 tuple(high + relief), settings.use_intensity)
-        view = wide.crop(low, high)
-        times.append(perf_counter())
+        view = wide.crop(config.low, config.high)
         is_ground = (segment_view_ground(view.frame, params.ground) if ground is None
                      else ground.take(view.indices))
         surface = fit_ground_surface(view.frame.xyz.compress(is_ground, axis=0), -SENSOR_HEIGHT)
-        flat = wide.flatten(surface).crop(low, high)
+        flat = wide.flatten(surface).crop(config.low, config.high)
         flat_ground = view.convert(is_ground, flat)
         assert flat_ground is not None
         obstacles = flat.frame.take(np.flatnonzero(~flat_ground))
@@ -163,7 +170,7 @@ class FusedDetector(NetworkDetector):
         # Compiled code releases the GIL, and much of PointPillars runs in one thread.
         with ThreadPoolExecutor(1) as pool:
             clusters = pool.submit(cluster_obstacles, flat.frame.xyz, flat_ground, params.people,
-                                   frame.xyz)
+                                   wide.source.xyz)
             _, cluster_ids = run_experts(view.frame, config, is_ground, view.take(cluster_ids),
                                          params.ground, params.clustering)
             found = self.proposer.propose(
@@ -183,7 +190,7 @@ class FusedDetector(NetworkDetector):
         boxes = move_towards(proposed.boxes, boxes, settings.classifier_box).astype(np.float32)
         times.append(perf_counter())
         return Proposals(replace(proposed, boxes=boxes), evidence, obstacles.xyz, surface,
-                         found.problem, dict(zip(STEPS, (np.diff(times) * 1e3).tolist())))
+                         found.problem, dict(zip(STEPS[1:], (np.diff(times) * 1e3).tolist())))
 
     def decide(self, proposals: Proposals) -> tuple[Detections, dict[str, float]]:
         """Return the proposals that are detections, best first, in the coordinates of the view;

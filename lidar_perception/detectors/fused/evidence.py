@@ -1,22 +1,32 @@
-"""Evidence for each proposal: PointPillars' score, the silhouettes of clusters near its centre, and
-the classification of its points by PointNet.
+"""Evidence for each proposal and its combination to a probability.
 
-All coordinates are those of a level sensor at SENSOR_HEIGHT. Clusters without a proposal are
-ignored: they did not improve the detections on simulated or real scans.
+The sources are PointPillars' score, the silhouettes of clusters near the centre, and the
+classification of the points by PointNet. All coordinates are those of a level sensor at
+SENSOR_HEIGHT. Clusters without a proposal are ignored: they did not improve the detections.
+
+The log-odds of a class are a sum of one curve per source. Sources that see the same object are not
+independent, so a plain sum would be overconfident. The curves are therefore fitted jointly, on
+simulated scans that no source was trained on, so that the sum is a calibrated probability.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import logit
+from scipy.special import expit, logit
 
-from lidar_perception.candidates.boxes import snap_to_ground
-from lidar_perception.candidates.confidence import compute_confidence, compute_shape_features
+from lidar_perception.candidates.confidence import (
+    compute_confidence,
+    compute_log_odds,
+    compute_shape_features,
+)
 from lidar_perception.candidates.configurations import BEST
+from lidar_perception.candidates.segmented_cloud import snap_to_ground
 from lidar_perception.clustering.shapes import fit_boxes
+from lidar_perception.detectors.fused.fusion import Models
 from lidar_perception.geometry import centre_distances
 from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.groups import group_points
+from lidar_perception.types import CLASSES
 
 # Size of clusters that may be a person or a cyclist.
 MIN_HEIGHT_M, MAX_HEIGHT_M, MAX_LENGTH_M = 0.8, 2.6, 2.8
@@ -56,3 +66,48 @@ def find_silhouette_confidence(boxes: np.ndarray, xyz: np.ndarray, ground: np.nd
 def to_log_odds(probabilities: np.ndarray) -> np.ndarray:
     """Return log-odds (K,) float64 of clipped probabilities (K,); NaN remains NaN."""
     return logit(np.clip(np.asarray(probabilities, np.float64), MIN_PROBABILITY, MAX_PROBABILITY))
+
+
+def compute_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence) -> np.ndarray:
+    """Return the probability (K,) float32 that each proposal is an object of its class.
+
+    Args:
+        class_ids: (K,) indices into CLASSES; a class without a model gets 0.
+    """
+    result = np.zeros(len(class_ids), np.float32)
+    for class_id in np.unique(class_ids):
+        own = class_ids == class_id
+        if CLASSES[class_id] in models:
+            result[own] = expit(compute_log_odds(models[CLASSES[class_id]],
+                                                 {source: odds[own] for source,
+                                                  odds in evidence.items()}))
+    return result
+
+
+def compute_max_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence,
+                              source: str) -> np.ndarray:
+    """Return the highest probability (K,) float32 that each proposal can reach for any evidence of
+    `source`.
+
+    A curve is linear between its knots and constant beyond, so its maximum is at a knot or, without
+    evidence, its value for unknown.
+    """
+    best = np.full(len(class_ids), np.nan)
+    for class_id in np.unique(class_ids):
+        curve = models.get(CLASSES[class_id], {"curves": {}})["curves"].get(source)
+        if curve is not None and max(curve["values"]) > curve.get("unknown", 0.0):
+            best[class_ids == class_id] = curve["knots"][int(np.argmax(curve["values"]))]
+    return compute_probabilities(models, class_ids, {**evidence, source: best})
+
+
+def compute_source_probabilities(models: Models, class_ids: np.ndarray,
+                                 evidence: Evidence) -> dict[str, np.ndarray]:
+    """Return, by source, the probability (K,) float32 from this source alone.
+
+    It is NaN where the source gives no evidence, or is not part of the model of the class.
+    """
+    used_for = {source: [i for i, name in enumerate(CLASSES)
+                         if source in models.get(name, {"curves": {}})["curves"]]
+                for source in evidence}
+    return {source: np.where(np.isin(class_ids, used_for[source]), expit(odds), np.nan).astype(
+        np.float32) for source, odds in evidence.items()}

@@ -40,7 +40,7 @@ KNOTS = {  # source -> knots of its piecewise linear curve, in log-odds
     "silhouette": (-4.0, -2.5, -1.0, 0.0, 1.0, 2.5),
 }
 
-# By class, the model of the sources' log-odds, see candidates/curves.py.
+# By class, the model of the sources' log-odds, see candidates/confidence.py.
 Models = Mapping[str, Any]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -11,10 +10,10 @@ from time import perf_counter
 import numpy as np
 
 from lidar_perception.detectors.base import NetworkDetector, make_synthetic_frame
-from lidar_perception.detectors.checkpoint import Header, read_arrays
+from lidar_perception.detectors.checkpoint import Header, read_arrays, read_header
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.devices import CPU, find_device, uses_16_bits
-from lidar_perception.detectors.layer_weights import Misfit
+from lidar_perception.detectors.layer_weights import Misfit, to_arrays
 from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.detectors.normalized_view import NormalizedView, restore_detections
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
@@ -142,12 +141,26 @@ def load_detector(path: str | Path = "", device: str = "auto",
 
 def _load_network(path: Path, device: str, params: PointPillarsParams) -> tuple[Header, Network]:
     """Load the network of a checkpoint; with torch only where the sparse engine cannot run it."""
-    if device == CPU and params.engine != "torch" and not uses_16_bits(params.amp):
-        with suppress(Misfit):  # torch finds out what does not fit
-            header, tensors = read_arrays(path, NetworkConfig)
-            if find_unsupported_part(header.config) is None:
-                return header, SparseNetwork(header.config, tensors)
+    if device == CPU and params.engine != "torch":
+        reason = find_unsupported_part(read_header(path, NetworkConfig).config)
+        if not reason and uses_16_bits(params.amp):
+            reason = "it supports float32 only, and amp selects 16 bits"
+        if not reason:
+            return _load_sparse(path)
+        if params.engine == "sparse":
+            raise InputError(f"the sparse engine cannot run this network: {reason}; choose the "
+                             "engine auto or torch")
     from lidar_perception.detectors.pointpillars.network import load_network
     from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
     header, network = load_network(path)
-    return header, TorchNetwork(network, CPU, params.amp, params.engine)
+    return header, TorchNetwork(network, CPU, params.amp)
+
+
+def _load_sparse(path: Path) -> tuple[Header, SparseNetwork]:
+    try:
+        header, tensors = read_arrays(path, NetworkConfig)
+        return header, SparseNetwork(header.config, tensors)
+    except Misfit:  # torch names what does not fit, and reads number formats that NumPy lacks
+        from lidar_perception.detectors.pointpillars.network import load_network
+        header, network = load_network(path)
+        return header, SparseNetwork(header.config, to_arrays(network))

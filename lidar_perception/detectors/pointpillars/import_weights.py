@@ -4,7 +4,7 @@ Both projects store the same network under other names. The differences are conv
 
 - Points have a tenth input, the height above the middle of the range (middle_z of the config).
   mmdetection3d replaces x, y and z by x_p, y_p and z_p; the weights of both are added.
-- A pillar has its first 32 points and is pad_channels with zeros that take part in the maximum
+- A pillar has its first 32 points and is padded with zeros that take part in the maximum
   (max_points and zero_row of the config).
 - OpenPCDet spreads anchors from edge to edge, mmdetection3d places them at the centres of cells.
   The origin of the two heading bins and the height of anchors differ too. In mmdetection3d the z of

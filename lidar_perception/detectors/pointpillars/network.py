@@ -4,7 +4,7 @@
     map of clusters -> MapNet (V4) -------+
 
 B clouds, N points, H x W pillars, C channels, K classes, A anchors. Images are channels-last in
-memory. Targets, losses and decoding are in targets.py, losses.py and box_coder.py.
+memory. Targets, losses and decoding are in targets.py, losses.py and anchors.py.
 """
 
 from __future__ import annotations
@@ -164,20 +164,14 @@ class Head(nn.Module):
     def boxes_at(self, features: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
         """Return codes (M, 7) and directions (M, 2) at anchors (M,) of a single cloud."""
         rows = features[0].flatten(1)[:, anchors // self.per_cell].T  # (M, C)
-        return self.boxes_of(rows, anchors % self.per_cell)
+        numbers = anchors % self.per_cell                             # within the cell
 
-    def boxes_of(self, rows: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """Return codes (M, 7) and directions (M, 2) from the features (M, C) of M cells.
-
-        Args:
-            numbers: (M,) index of the anchor within its cell.
-        """
-        def one(conv: nn.Conv2d, width: int) -> Tensor:
+        def apply(conv: nn.Conv2d, width: int) -> Tensor:
             weight = conv.weight.view(self.per_cell, width, -1)[numbers]  # (M, width, C)
             bias = _bias(conv).view(self.per_cell, width)[numbers]
             return torch.baddbmm(bias[:, :, None], weight, rows[:, :, None])[:, :, 0]
 
-        return one(self.codes, CODE), one(self.directions, BINS)
+        return apply(self.codes, CODE), apply(self.directions, BINS)
 
 
 def _bias(conv: nn.Conv2d) -> Tensor:

@@ -22,8 +22,7 @@ from lidar_perception.detectors.normalized_view import (
     rotate_half_turn,
 )
 from lidar_perception.detectors.params import NmsParams, ScoreParams
-from lidar_perception.detectors.pointpillars.anchors import make_anchors
-from lidar_perception.detectors.pointpillars.box_coder import decode
+from lidar_perception.detectors.pointpillars.anchors import decode, make_anchors
 from lidar_perception.detectors.pointpillars.config import HALF, RANGES, NetworkConfig
 from lidar_perception.detectors.pointpillars.expert import NetworkInput, make_network_input
 from lidar_perception.detectors.pointpillars.pillars import make_pillars

@@ -79,7 +79,7 @@ class Layer:
 
 
 def dilate(mask: np.ndarray, cells: int) -> np.ndarray:
-    """Return the mask (H, W) dilate by `cells` along both axes."""
+    """Return the mask (H, W) dilated by `cells` along both axes."""
     for _ in range(cells):
         rows = mask.copy()
         rows[1:] |= mask[:-1]

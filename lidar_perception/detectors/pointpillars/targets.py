@@ -44,7 +44,7 @@ class SparseTargets(NamedTuple):
 
 
 def encode(boxes: Tensor, anchors: Tensor, offset: float) -> tuple[Tensor, Tensor]:
-    """Encode boxes relative to anchors, the inverse of box_coder.decode.
+    """Encode boxes relative to anchors, the inverse of anchors.decode.
 
     Args:
         boxes: (N, 7) [x y z l w h yaw]; l w h must be above 0.
