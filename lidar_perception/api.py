@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -192,8 +193,9 @@ def evaluate(detector: str | Path | Detector | Callable[[PointCloud], Detections
         loaded = as_detector(detector)
         loaded = loaded if min_score is None else loaded.with_min_score(min_score)
     report = DetectionReport(follow=recording.is_sequential)
+    start = partial(measure_detector, lambda: loaded, 1.0, None)
     numbers = range(min(len(recording), limit or len(recording)))
-    for _, result in measure_frames(recording, measure_detector(lambda: loaded), numbers):
+    for _, result in measure_frames(recording, start, numbers):
         if isinstance(result, Skipped):
             report.skipped.append(str(result))
         elif result is not None:

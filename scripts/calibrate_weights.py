@@ -46,7 +46,8 @@ def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -
     for path in weights:
         report = DetectionReport()
         fill(report, open_recording(scans),
-             measure_detector(partial(load_uncalibrated, path)), jobs=jobs, limit=limit)
+             partial(measure_detector, partial(load_uncalibrated, path), 1.0, None), jobs=jobs,
+             limit=limit)
         found = fit_calibrations(Comparison.of(report.frames)) if report.frames else {}
         header = read_header(path)
         if lost := sorted({*header.calibration} - {*found}):

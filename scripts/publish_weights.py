@@ -64,7 +64,8 @@ def evaluate_weights(weights: Path, folder: Path) -> dict[str, Any]:
     """Return the results of `evaluate detection --intervals` as JSON data."""
     recording = open_recording(folder)
     report = DetectionReport(follow=recording.is_sequential)
-    fill(report, recording, measure_detector(partial(open_detector, weights, min_score=MIN_SCORE)))
+    fill(report, recording, partial(
+        measure_detector, partial(open_detector, weights, min_score=MIN_SCORE), 1.0, None))
     return {**report.compute(), "intervals": report.intervals(SAMPLES)}
 
 

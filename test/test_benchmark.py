@@ -59,7 +59,7 @@ def test_contenders_run_in_turn_after_untimed_warm_up():
 
 
 @pytest.mark.parametrize("place", range(len(peers.DBSCANS)))
-def test_the_peers_of_dbscan_give_our_clusters(place):
+def test_dbscan_peers_give_our_clusters(place):
     peer = peers.DBSCANS[place]
     if peer.missing():
         pytest.skip(f"{peer.package} is {peer.missing()}")
@@ -70,7 +70,7 @@ def test_the_peers_of_dbscan_give_our_clusters(place):
 
 
 @pytest.mark.parametrize("threshold", ["local", "global"])
-def test_the_plain_euclidean_gives_our_clusters(threshold):
+def test_plain_euclidean_gives_our_clusters(threshold):
     params = EuclideanParams(threshold=threshold)
     ours = cluster_euclidean(cloud(), params)
     assert ours.max() > 0
@@ -88,14 +88,14 @@ def test_same_clusters_compares_noise_and_core_partition():
 
 @pytest.mark.parametrize("unit, target, good, bad, text", [
     ("x", 12, 12.0, 11.9, "12x"), ("ms", 60, 59.9, 60.0, "< 60 ms"), ("", 1.1, 1.0, 1.1, "< 1.1")])
-def test_a_missed_target_is_shown(unit, target, good, bad, text):
+def test_missed_target_is_shown(unit, target, good, bad, text):
     assert make_row("a", value=good, unit=unit, target=target)["met"] is True
     assert make_row("a", value=bad, unit=unit, target=target)["met"] is False
     assert make_row("a", value=None, unit=unit, target=target)["met"] is None
     assert format_target(target, unit) == text and format_value(None, unit) == ""
 
 
-def test_peers_that_are_not_installed_are_said_to_be(nothing_installed, capsys):
+def test_missing_peers_are_reported(nothing_installed, capsys):
     xyz, frame = cloud(), PointCloud(scene()[:, :3], scene()[:, 3])
     for content in (measure_dbscan("DBSCAN", [xyz], 1, 12.0), ground.measure_patchwork([frame], 1),
                     ground.measure_cloth([xyz], 1)):
@@ -150,7 +150,7 @@ def test_engines_are_timed_and_compared(one_thread, capsys):
 
 
 @pytest.mark.no_cover
-def test_start_is_measured_with_and_without_torch(monkeypatch, capsys):
+def test_startup_is_measured_with_and_without_torch(monkeypatch, capsys):
     monkeypatch.setattr(startup, "CODE", {"fused": "a = 0", "fused, engine torch": "import numpy",
                                           "clustering": "a = 1"})
     content = measure_startup(1, cold=("clustering",))
@@ -159,7 +159,7 @@ def test_start_is_measured_with_and_without_torch(monkeypatch, capsys):
     assert content["rows"][0]["value"] > 1  # loading NumPy takes longer than loading nothing
 
 
-def test_the_cluster_network_is_timed_beside_a_plain_one(one_thread, capsys):
+def test_pointnet_is_timed_against_a_plain_network(one_thread, capsys):
     points = scene()
     content = measure_pointnet([PointCloud(points[:, :3], points[:, 3])] * 2, 1)
     print_pointnet(json.loads(json.dumps(content)))
@@ -172,7 +172,7 @@ def test_the_cluster_network_is_timed_beside_a_plain_one(one_thread, capsys):
     assert ball(0.2, 2, xyz, xyz[:, :1]).tolist() == [[[0, 2]]]
 
 
-def test_the_command_writes_what_it_measured(nothing_installed, monkeypatch, tmp_path):
+def test_command_writes_the_measurements(nothing_installed, monkeypatch, tmp_path):
     pytest.importorskip("cv2")
     monkeypatch.setattr(peers, "TRIALS", 20)
     import benchmark.__main__ as benchmark

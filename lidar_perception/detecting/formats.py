@@ -173,7 +173,7 @@ class Csv(BufferedFormat):
         self.table.writerow(COLUMNS)
 
     def add(self, result: FrameResult) -> None:
-        """Keep the make_rows of a frame."""
+        """Keep the rows of a frame."""
         frame = result.frame
         for row in make_rows(result):
             self.table.writerow([

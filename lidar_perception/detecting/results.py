@@ -13,7 +13,6 @@ import numpy as np
 
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.contract import Detector
-from lidar_perception.scoring.run import Start
 from lidar_perception.tracking.drive_tracker import DriveTracker
 from lidar_perception.tracking.state import Tracks
 from lidar_perception.tracking.trails import Trails
@@ -53,16 +52,11 @@ class FrameResult:
         return self.detections if self.tracks is None else self.tracks.detections
 
 
-def start_detection(open_: Callable[[], Detector]) -> Start:
-    """Return a Start that runs a detector on every frame and returns its record, a JSON text.
+def measure_records(open_: Callable[[], Detector], recording: Recording) -> Callable[[Frame], str]:
+    """Return a function that runs the detector of open_() and returns its record, a JSON text.
 
-    Args:
-        open_: opens the detector.
+    partial(measure_records, open_) is a Start of scoring.run.
     """
-    return partial(_start_detection, open_)
-
-
-def _start_detection(open_: Callable[[], Detector], recording: Recording) -> Callable[[Frame], str]:
     detector = open_()
 
     def measure(frame: Frame) -> str:
@@ -78,15 +72,15 @@ def _start_detection(open_: Callable[[], Detector], recording: Recording) -> Cal
             "frame": frame.name, "frame_id": scan.frame_id, "ms": round(ms, 3),
             "problem": found.problem, "classes": [CLASSES[i] for i in objects.class_ids],
             "boxes": to_short_floats(objects.boxes), "scores": to_short_floats(objects.scores),
-            "sources": {name: to_short_floats(said) for name, said in objects.sources.items()}})
+            "sources": {name: to_short_floats(p) for name, p in objects.sources.items()}})
     return measure
 
 
 def read_detections(record: Mapping[str, Any]) -> Detections:
     """Return the detections of a record, bit for bit."""
     found = Detections.of(record["boxes"], class_ids(record["classes"]), record["scores"])
-    return replace(found, sources={name: np.array(said, np.float32)
-                                   for name, said in record["sources"].items()})
+    return replace(found, sources={name: np.array(probabilities, np.float32)
+                                   for name, probabilities in record["sources"].items()})
 
 
 def to_short_floats(values: np.ndarray) -> Any:
@@ -118,34 +112,29 @@ def with_optional_parts(frame: Frame, report: Callable[[str], None]) -> Frame:
         pose=cache(partial(read_or_none, frame.pose, "pose")))
 
 
-def start_writing(record_of: Callable[[str], Mapping[str, Any]], min_scores: Mapping[str, float],
-                  tracker: Callable[[Recording], DriveTracker] | None,
-                  report: Callable[[str], None], scans: bool = False) -> Start:
-    """Return a Start that makes the FrameResult of every frame from its record.
+def make_results(read_record: Callable[[str], Mapping[str, Any]], min_scores: Mapping[str, float],
+                 make_tracker: Callable[[Recording], DriveTracker] | None,
+                 report: Callable[[str], None], scans: bool,
+                 recording: Recording) -> Callable[[Frame], FrameResult]:
+    """Return a function that makes the FrameResult of a frame from its record.
 
-    Frames must be processed in order of time, in one process.
+    Frames must be processed in order of time, in one process. With all arguments but the last,
+    partial() makes this a Start of scoring.run.
 
     Args:
-        record_of: returns the record of a frame by its name.
+        read_record: returns the record of a frame by its name.
         min_scores: threshold of each class.
-        tracker: returns the tracker for a recording, which also uses weak detections; None: no
+        make_tracker: returns the tracker for a recording, which also uses weak detections; None: no
             tracks.
         report: see with_optional_parts.
         scans: also read the scans; frames whose scan cannot be read are skipped.
     """
-    return partial(_start_writing, record_of, min_scores, tracker, report, scans)
-
-
-def _start_writing(record_of: Callable[[str], Mapping[str, Any]], min_scores: Mapping[str, float],
-                   tracker_of: Callable[[Recording], DriveTracker] | None,
-                   report: Callable[[str], None], scans: bool,
-                   recording: Recording) -> Callable[[Frame], FrameResult]:
     thresholds = np.array([min_scores.get(name, 0.0) for name in CLASSES], np.float32)
-    tracker = None if tracker_of is None else tracker_of(recording)
+    tracker = None if make_tracker is None else make_tracker(recording)
     trails = Trails()
 
     def measure(frame: Frame) -> FrameResult:
-        record = record_of(frame.name)
+        record = read_record(frame.name)
         if (reason := record.get("skipped")) is not None:
             raise InputError(reason)
         frame, found = with_optional_parts(frame, report), read_detections(record)

@@ -18,7 +18,7 @@ import numpy as np
 from lidar_perception import __version__
 from lidar_perception.data.frame import Recording
 from lidar_perception.detecting.formats import Format, Run, mask_numbers
-from lidar_perception.detecting.results import FrameResult, start_detection, start_writing
+from lidar_perception.detecting.results import FrameResult, make_results, measure_records
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import ConfigurableDetector, resolve_weights
 from lidar_perception.param_fields import flatten
@@ -110,7 +110,7 @@ def detect(run: Run, open_: Callable[[], Detector], formats: Sequence[Callable[[
     Detections are written if they reach the min_scores of run.header. With tracking, the tracks of
     all detections are written instead. Finished frames are saved in run.out at once. A stopped run
     with the same header is resumed, and other formats are added without detecting again. Except for
-    durations, results do not depend on resuming, jobs or dask (see scoring.run.results).
+    durations, results do not depend on resuming, jobs or dask, see scoring.run.measure_frames.
 
     Args:
         open_: opens the detector.
@@ -124,17 +124,17 @@ def detect(run: Run, open_: Callable[[], Detector], formats: Sequence[Callable[[
     tracker = None if tracking is None else partial(DriveTracker, params=tracking, ego=ego)
     with open_journal(run.out, run.header, force=force, list_files=list_outputs) as done:
         names = [frame.name for frame in islice(recording, run.count)]
-        fill_journal(done, recording, start_detection(open_), names, jobs=jobs, dask=dask,
+        fill_journal(done, recording, partial(measure_records, open_), names, jobs=jobs, dask=dask,
                      title="detecting")
         done.sort(names)
 
-        def record_of(name: str) -> Any:
+        def read_record(name: str) -> Any:
             return json.loads(done.lines[name])
 
         with ExitStack() as stack:
             made = [stack.enter_context(make(run)) for make in formats]
-            start = start_writing(record_of, run.header["min_scores"], tracker, run.add_remark,
-                                  scans=any(each.needs_scans for each in made))
+            start = partial(make_results, read_record, run.header["min_scores"], tracker,
+                            run.add_remark, any(each.needs_scans for each in made))
             summary = Summary(made, skipped=run.skipped)
             fill(summary, recording, start, limit=run.count, title="writing")
     return summary

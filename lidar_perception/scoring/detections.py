@@ -5,7 +5,6 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Generic, TypeVar
@@ -22,7 +21,6 @@ from lidar_perception.data.kitti.results import (
 )
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.runs import journal
-from lidar_perception.scoring.run import Start
 from lidar_perception.types import Detections, GroundTruth, InputError, PointCloud, RunError
 
 BoxesT = TypeVar("BoxesT", bound=Detections | GroundTruth)
@@ -83,20 +81,17 @@ def run_detector(detector: Detector, frame: Frame, truth: GroundTruth | None,
                            (perf_counter() - begin) * 1e3)
 
 
-def measure_detector(open_: Callable[[], Detector], keep: float = 1.0, folder: Path | None = None
-                     ) -> Start:
-    """Make a Start that runs the detector of open_() on every labelled frame.
+def measure_detector(open_: Callable[[], Detector], keep: float, folder: Path | None,
+                     recording: Recording
+                     ) -> Callable[[Frame], FrameDetections[Detections] | None]:
+    """Make a function that runs the detector of open_() on each labelled frame.
+
+    partial(measure_detector, open_, keep, folder) is a Start of scoring.run.
 
     Args:
         keep: share of the points that the detector gets, 0..1.
         folder: also run on frames without labels, and write KITTI result files there.
     """
-    return partial(_measure_detector, open_, keep, folder)
-
-
-def _measure_detector(open_: Callable[[], Detector], keep: float, folder: Path | None,
-                      recording: Recording
-                      ) -> Callable[[Frame], FrameDetections[Detections] | None]:
     detector = open_()
 
     def measure(frame: Frame) -> FrameDetections[Detections] | None:

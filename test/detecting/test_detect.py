@@ -159,7 +159,7 @@ def test_bag_with_duplicate_stamps_is_written_without_labels(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("camera", [True, False], ids=["camera", "nominal"])
-def test_written_results_score_as_the_detector_itself(kitti, tmp_path, monkeypatch, camera, capsys):
+def test_written_results_score_like_the_detector(kitti, tmp_path, monkeypatch, camera, capsys):
     write(kitti / "training/velodyne/000002.bin", b"123")  # which is skipped by both
     if not camera:
         frames = [replace(frame, calibration=return_none) for frame in open_recording(kitti)]
@@ -211,12 +211,13 @@ def test_tracks_have_ids_and_velocities_that_never_mix(drives, tmp_path, monkeyp
         assert [e["track_id"] for e in tracks.extras] == each.track_ids.tolist()
 
 
-def test_written_tracks_score_as_the_tracker_itself(drives, tmp_path, monkeypatch):
+def test_written_tracks_score_like_the_tracker(drives, tmp_path, monkeypatch):
     assert detect(monkeypatch, drives, "--out", tmp_path, "--format", "kitti", "--track",
                   "--ego", "none", "--force") == 0
     recording, itself, read = open_recording(drives), TrackingReport(), TrackingReport()
     fill(
-        itself, recording, measure_tracking(lambda: MadeDetector().with_min_score(0.05), ego="none")
+        itself, recording, partial(
+            measure_tracking, lambda: MadeDetector().with_min_score(0.05), TrackingParams(), "none")
     )
     for frame in recording:
         if (truth := frame.truth()) is not None:
@@ -328,7 +329,7 @@ def test_unreadable_labels_and_cameras_are_optional(kitti, tmp_path, monkeypatch
     assert len(read_json(tmp_path / "out")["frames"]) == 4
 
 
-def test_what_is_wrong_is_said_once_with_its_count(kitti, tmp_path, monkeypatch, capsys):
+def test_equal_problems_are_reported_once_with_count(kitti, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(MadeDetector, "__call__", lambda self, frame: DetectionResult(
         Detections.none(), problem=f"{np.ptp(frame.xyz)} m are not much"))
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out") == 0

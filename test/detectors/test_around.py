@@ -78,7 +78,7 @@ def test_around_equals_single_pass_away_from_border(street):
     assert len(apart[0]) > 3 and same(*apart)
 
 
-def test_there_and_back_it_is_the_same_detector(street):
+def test_range_can_be_changed_and_restored(street):
     detector = shipped("v1")
     around = detector.with_range("around")
     assert detector.with_range("auto") is detector.with_range("ahead") is detector

@@ -140,7 +140,7 @@ def test_ego_vehicle_is_dropped_and_next_car_is_kept(pose):
     assert len(restore_detections(low, pose)) == 3
 
 
-def test_every_network_leaves_out_what_carries_it(detectors, frame, monkeypatch):
+def test_every_network_drops_the_ego_vehicle(detectors, frame, monkeypatch):
     monkeypatch.setattr(normalized_view, "drop_ego_vehicle",
                         lambda detections, height: detections[:0])
     for name in NAMES:

@@ -187,7 +187,7 @@ def test_smaller_x_and_y_need_larger_weights():
 
 
 @pytest.mark.parametrize("middle_z", [False, True])
-def test_limited_pillars_are_those_of_padded_code(middle_z):
+def test_limited_pillars_equal_padded_pillars(middle_z):
     config = tiny("v0", max_points=2, zero_row=True, middle_z=middle_z, xy_scale=1.0)
     network, points = lively(config), some_points(config, 900)
     net, low = network.pillar_net, torch.tensor(config.low)
@@ -247,7 +247,7 @@ def test_folding_the_norms_changes_nothing(version):
     assert not [m for m in folded.modules() if isinstance(m, torch.nn.BatchNorm2d)]
 
 
-def test_boxes_at_some_anchors_are_those_of_all():
+def test_boxes_at_chosen_anchors_equal_those_of_all():
     config = tiny("v1")
     network = lively(config)
     features = network.features(make_pillar_batch([some_points(config)], config))

@@ -83,7 +83,7 @@ def test_axis_aligned_iou_equals_textbook_formula():
     assert nearest_axis_iou(a, b)[0].tolist() == [pytest.approx(6 / 10), 0.0]
 
 
-def test_targets_are_those_of_a_plain_reading():
+def test_targets_equal_a_plain_implementation():
     config = tiny("v0")
     anchors, classes = anchor_tensors(config)
     rng = np.random.default_rng(3)

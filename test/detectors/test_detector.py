@@ -73,7 +73,7 @@ def test_versions_see_what_the_paper_says():
 MAP_CLASSES = ("Car", "Cyclist", "Pedestrian")  # by the channels of paper B
 
 
-def test_the_map_is_that_of_a_plain_loop_over_cells():
+def test_cluster_map_equals_a_plain_loop_over_cells():
     config = tiny("v4", cell=0.16)
     rng = np.random.default_rng(4)
     spots = rng.uniform([0, -6, 0], [10.5, 6, 0], (25, 3))
@@ -208,7 +208,7 @@ def test_best_scores_are_reported_without_detections():
     assert "NaN" in detector(scan).problem
 
 
-def test_many_points_and_broken_ones_are_no_trouble():
+def test_huge_and_non_finite_clouds_are_handled():
     detector, scan = random_detector("v2"), frame()
     xyz = np.tile(scan.xyz, (250, 1))
     xyz[:5] = [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [1e9, 0, 0], [-np.inf, 0, np.nan]]
@@ -259,7 +259,7 @@ def test_cpu_fallback_after_out_of_memory_is_reported():
 
 @pytest.mark.parametrize("name, words", [("tpu", "no device 'tpu'"), ("mps", "no device 'mps'"),
                                          ("cuda:99", "CUDA device")])
-def test_a_device_that_is_not_there_is_refused(name, words):
+def test_missing_device_is_refused(name, words):
     with pytest.raises(InputError, match=words):
         find_device(name)
     assert find_device("cpu") == CPU

@@ -248,6 +248,21 @@ def test_sensor_height_and_given_columns_change_nothing(detector):
     assert same(detector(scan, ground=ground | ~np.isin(np.arange(len(scan)), view.indices)), found)
 
 
+@pytest.mark.parametrize("use_intensity", [True, False])
+@pytest.mark.parametrize("height", [1.73, 2.5])
+def test_ground_of_experts_in_range_gives_equal_detections(detector, height, use_intensity):
+    """The node ground_segmentation segments the range of the detector only, with intensity."""
+    own = detector.with_params(with_values(detector.params, {
+        "fused.use_intensity": use_intensity})).with_sensor_height(height)
+    scan, config = frame(), own.proposer.config
+    scan = replace(scan, xyz=scan.xyz - np.array([0, 0, height - 1.73], np.float32))
+    view = NormalizedView.of(scan, own.params.ground.sensor_pose, config.low, config.high)
+    ground = np.zeros(len(scan), bool)
+    ground[view.indices] = segment_view_ground(view.frame, own.params.ground)
+    found = own(scan)
+    assert len(found.detections) > 3 and same(own(scan, ground=ground), found)
+
+
 def test_ignored_intensity_equals_missing_intensity(detector):
     """Also for the ground segmentation, which removes low dark points as reflections."""
     scan, other = frame(), copy.copy(detector)

@@ -178,7 +178,7 @@ def test_nearest_equals_brute_force(rng):
 
 
 @pytest.mark.parametrize("name", ["improved", "ball-density"])
-def test_groups_are_what_plain_loops_make_of_them(rng, name):
+def test_groups_equal_plain_loops(rng, name):
     net = network(name)
     inputs = make_network_input(blobs(rng, [60, 5]), net.config.points)
     points, valid = torch.from_numpy(inputs.points), torch.from_numpy(inputs.valid)
@@ -205,7 +205,7 @@ def test_groups_are_what_plain_loops_make_of_them(rng, name):
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_points_that_fill_up_a_cluster_change_nothing(rng, name):
+def test_padding_points_change_nothing(rng, name):
     net = network(name)
     clusters = blobs(rng, [10, 12, 2, 24, 6, 7, 40])
     inputs = make_network_input(clusters, net.config.points)

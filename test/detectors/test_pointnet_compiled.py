@@ -76,7 +76,7 @@ def test_clusters_do_not_depend_on_those_around_them(monkeypatch):
 
 @pytest.mark.parametrize("name", ["points.0.0.weight", "local.nets.1.0.0.weight",
                                   "coarse.net.0.0.weight", "fine.0.0.bias"])
-def test_weights_that_are_no_numbers_are_no_answer(name):
+def test_nan_weights_give_nan_logits(name):
     network = fuse_norms(lively(small()))
     network.get_parameter(name).view(-1)[0] = torch.nan
     inputs = make_network_input(blobs(np.random.default_rng(3), SIZES), 32)

@@ -206,7 +206,7 @@ def test_best_scores_are_reported_without_detections(ids):
 
 
 @pytest.mark.parametrize("layer", ["classes", "box"])
-def test_what_is_not_a_number_is_left_out_and_said(layer, ids):
+def test_nan_outputs_are_left_out_and_reported(layer, ids):
     detector, scan = random_detector(), frame()
     dark = replace(scan, intensity=np.where(ids == 2, np.float32(0), scan.intensity))
     expected = detector(dark, cluster_ids=np.where(ids == 2, 0, ids)).detections
@@ -335,7 +335,7 @@ def test_weights_of_other_network_or_classes_are_refused(saved, tmp_path):
     assert result.exit_code and not (tmp_path / "o").exists()
 
 
-def test_fewer_classes_are_found_as_what_they_are(ids):
+def test_network_with_one_class_keeps_its_class_id(ids):
     config = small(classes=("Pedestrian",), sizes=small().sizes[1:2])
     found = PointNetDetector(make_classifier(lively(config), Header(config)), eager())(
         frame(), cluster_ids=ids).detections

@@ -49,7 +49,7 @@ def scans(streets):
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_each_finds_most_cars_that_are_plain_to_see(file, scans):
+def test_each_network_finds_most_clear_cars(file, scans):
     detector = open_detector(file, "cpu")
     found = hits = 0
     for scan in scans[2:] if "full" in file.stem else scans[1:]:  # these are slow
@@ -80,7 +80,7 @@ def test_only_cars_are_moved_to_their_points(name, scans):
     np.testing.assert_array_equal(after.scores, before.scores)
 
 
-def test_no_car_is_seen_where_the_recording_car_is(data):
+def test_ego_vehicle_is_not_detected(data):
     """All around, in whole scans of KITTI, whose roof returns some points."""
     frames = [frame for frame in open_recording(data / "kitti_object")
               if (frame.load().xyz[:, 0] < -5).any()][:3]

@@ -167,7 +167,7 @@ def test_an_error_in_one_part_is_raised(monkeypatch):
 
 @pytest.mark.parametrize("layer", ["pillar_net.linear.weight", "blocks.1.0.0.weight",
                                    "neck.laterals.2.weight"])
-def test_weights_that_are_no_numbers_are_reported(layer):
+def test_nan_weights_are_reported(layer):
     config = tiny("v4")
     network = lively(config)
     network.get_parameter(layer).fill_(torch.nan)

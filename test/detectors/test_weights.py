@@ -76,7 +76,7 @@ def test_other_config_is_refused_with_both_values(saved):
         load_detector(path, "cpu", with_values(DetectorParams(), {"pointpillars.size": "full"}))
 
 
-def test_a_network_begins_with_what_fits_of_another(saved):
+def test_matching_weights_of_another_network_are_copied(saved):
     path, header, network = saved
     state = network.state_dict()
     same = make_network(header.config)
@@ -231,7 +231,7 @@ def big():
     ("OpenPCDet", lambda s: {"epoch": 80, "model_state": {**s, "global_step": torch.tensor([5])}}),
     ("mmdetection3d", lambda s: {"meta": {"epoch": 160}, "state_dict": {
         f"module.{k}": v for k, v in s.items()}})])
-def test_weights_of_other_projects_become_ours(project, wrapped, big, tmp_path):
+def test_weights_of_other_projects_are_imported(project, wrapped, big, tmp_path):
     path = tmp_path / "theirs.pth"
     torch.save(wrapped(theirs(big, project)), path)
     config, network, name = import_weights(path)

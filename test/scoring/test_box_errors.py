@@ -61,7 +61,7 @@ def test_scores_equal_to_share_of_right_boxes_are_reliable(seed):
 
 @settings(max_examples=5)
 @given(st.integers(0, 2**32 - 1))
-def test_lines_give_back_what_scores_were_before_they_were_bent(seed):
+def test_fitted_calibration_recovers_distorted_scores(seed):
     rng = np.random.default_rng(seed)
     true = cars(3000, rng)
     true[:, :2] *= 200
@@ -75,7 +75,7 @@ def test_lines_give_back_what_scores_were_before_they_were_bent(seed):
     assert fit_calibrations(Comparison.of([frame(true[:5], found[:5], bent[:5])])) == {}
 
 
-def test_errors_are_those_that_were_made():
+def test_known_box_errors_are_measured():
     true = cars(20, np.random.default_rng(0))
     made = dict(away=0.12, aside=-0.07, bottom=0.1, length=-0.2, width=0.0, height=0.06, yaw=0.05)
     errors = measure_box_errors([frame(true, moved(true, **made))], "Car", 0.2)
@@ -87,7 +87,7 @@ def test_errors_are_those_that_were_made():
     assert len(counts) == len(RANGES) and sum(counts[:-1]) == counts[-1] == 20
 
 
-def test_what_is_put_right_counts_and_what_is_not_found_does_not():
+def test_correcting_an_error_raises_the_overlap():
     true = cars(12, np.random.default_rng(1))
     off = moved(true)
     off[:4, 2] += 0.6    # 3D only

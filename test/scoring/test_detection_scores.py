@@ -80,7 +80,7 @@ def concatenate(*lines):
 
 @pytest.mark.parametrize("seed, count, noise", [(0, 30, 0.12), (1, 60, 0.05), (2, 12, 0.1),
                                                 (3, 20, 0.3), (4, 2, 0.1)])
-def test_a_second_reading_of_the_protocol_gives_the_same(seed, count, noise):
+def test_scores_equal_an_independent_implementation(seed, count, noise):
     rng = np.random.default_rng(seed)
     frames = [reference.random_frame(rng, noise=noise) for _ in range(count)]
     compared = Comparison.of(report(frames).frames)
@@ -191,7 +191,7 @@ def test_truncation_level_of_tracks_is_not_a_share():
     assert objects.truncated == pytest.approx([0, 0, share, 1, 0.21, share])
 
 
-def test_what_a_label_does_not_say_is_computed_from_its_box():
+def test_missing_label_fields_are_computed_from_the_box():
     text = "\n".join(car(left=100 * i, x=i - 3.0, z=15.0 + i, alpha=-10) for i in range(6))
     said, bare = labels(text), labels(text)
     bare = GroundTruth.of(bare.boxes, bare.class_ids)
@@ -272,7 +272,7 @@ def test_report_is_independent_of_batches_and_empty_frames():
     assert there == pytest.approx(back, abs=1e-9)
 
 
-def test_without_objects_or_frames_there_is_no_figure():
+def test_no_objects_or_frames_give_no_scores():
     content = report([]).compute()
     assert content["frames"] == 0 and content["ap"] == {} and content["map_3d"] is None
     content = report([("", car(score=0.5))]).compute()

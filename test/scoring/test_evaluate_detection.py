@@ -77,7 +77,7 @@ def truth_of(kitti):
     return Detections.of(truth.boxes, truth.class_ids, [0.9, 0.8])
 
 
-def test_the_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path, monkeypatch):
+def test_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     content, text = evaluate(tmp_path, "--data", kitti, "--results", found, "--intervals", 10)
     assert content["intervals"]["Car"] == {row: [100, 100] for row in INTERVALS}
@@ -93,7 +93,7 @@ def test_the_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path,
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_frames_of_a_bag_are_not_drawn_one_by_one(kitti, detector, tmp_path):
+def test_short_bag_has_no_interval(kitti, detector, tmp_path):
     """A second of one drive is one thing to draw, so there is no interval."""
     detector.find = lambda frame: truth_of(kitti)
     write_bag(tmp_path / "bag", open_recording(kitti))
@@ -103,7 +103,7 @@ def test_frames_of_a_bag_are_not_drawn_one_by_one(kitti, detector, tmp_path):
     assert content["intervals"]["Car"] == dict.fromkeys(INTERVALS)
 
 
-def test_a_label_without_its_scan_is_skipped_by_name(kitti, detector, found, tmp_path):
+def test_label_without_scan_is_skipped_by_name(kitti, detector, found, tmp_path):
     (kitti / "training/velodyne/000001.bin").unlink()
     content, text = evaluate(tmp_path, "--data", kitti, "--weights", "any")
     assert content["frames"] == 1 and "000001.txt has no scan" in content["skipped"][0]
@@ -136,7 +136,7 @@ def test_a_checkpoint_is_run_on_every_scan(kitti, detector, tmp_path):
             assert cell["r40"] == 100
 
 
-def test_a_share_of_the_points_is_kept_and_always_the_same(kitti, detector, tmp_path):
+def test_kept_share_of_points_is_repeatable(kitti, detector, tmp_path):
     kept = {}
     for share in (1, 0.1, 0.1):
         detector.scans.clear()
@@ -164,7 +164,7 @@ def test_a_smaller_share_is_part_of_a_larger_one(kitti):
     assert thin_scan(frame, 1.0, "a") is frame and len(before) == 0
 
 
-def test_written_results_score_as_what_was_found(kitti, detector, tmp_path):
+def test_written_results_score_like_the_detections(kitti, detector, tmp_path):
     noise = np.random.default_rng(0)
     detector.find = lambda frame: Detections.of(
         truth_of(kitti).boxes + noise.normal(0, 0.02, 7), truth_of(kitti).class_ids,
@@ -274,7 +274,7 @@ def test_a_bad_result_file_is_named_with_its_line(case, kitti, found, monkeypatc
     assert line.startswith("Error: ") and words in line and str(found) in line
 
 
-def test_what_is_missing_is_named(kitti, found, tmp_path, monkeypatch, capsys):
+def test_missing_files_and_labels_are_named(kitti, found, tmp_path, monkeypatch, capsys):
     def error(*arguments):
         return error_of(monkeypatch, capsys, "--data", kitti, *arguments)
 
@@ -308,7 +308,7 @@ def with_scores(labels):
     return "".join(f"{line} {1 - i / 100}\n" for i, line in enumerate(lines))
 
 
-def test_real_labels_as_their_own_results_score_100(data, tmp_path):
+def test_real_labels_as_results_score_100(data, tmp_path):
     root = data / "kitti_object"
     for path in root.glob("training/label_2/*.txt"):
         write(tmp_path / "found" / path.name, with_scores(path))

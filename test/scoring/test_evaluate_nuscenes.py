@@ -136,7 +136,7 @@ def test_only_the_best_boxes_of_a_frame_are_written(root):
         to_results(broken, frame)
 
 
-def test_what_cannot_be_read_or_is_refused_is_told(root, detector, tmp_path):
+def test_unreadable_and_rejected_scans_are_reported(root, detector, tmp_path):
     frames = open_nuscenes(root)
     frames[0].points.unlink()
     frames[1].points.write_bytes(bytes(30))

@@ -96,7 +96,7 @@ def test_matching_is_one_to_one_and_within_the_distance(seed, found_count, truth
     assert set(zip(*(x.tolist() for x in back))) == set(zip(j.tolist(), i.tolist()))
 
 
-def test_two_pairs_are_better_than_one_perfect_pair():
+def test_two_pairs_beat_one_perfect_pair():
     found, truth = boxes([0, 0, 0], [0.9, 0, 0]), boxes([0, 0, 0], [-0.9, 0, 0])
     pairs = match_centres(found, truth)
     assert set(zip(*(x.tolist() for x in pairs))) == {(0, 1), (1, 0)}
@@ -261,7 +261,7 @@ def test_only_pedestrians_count():
     assert select_pedestrians(None).shape == (0, 7)
 
 
-def test_labels_behind_the_camera_are_not_missed_in_its_view():
+def test_labels_behind_the_camera_do_not_count():
     cloud, truth = crowd(0)
     scan, people = PointCloud(cloud[:, :3], cloud[:, 3]), truth.of_class(PEDESTRIAN)
     ahead, behind, around = (

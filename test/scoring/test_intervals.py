@@ -16,7 +16,7 @@ from lidar_perception.scoring.intervals import (
 
 
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=15), st.booleans())
-def test_every_frame_is_in_one_block_and_a_block_is_of_one_drive(lengths, named):
+def test_blocks_partition_the_frames_of_each_drive(lengths, named):
     names = [f"{drive:04}/{i:06}" if named else f"{drive}{i:06}"
              for drive, count in enumerate(lengths) for i in range(count)]
     parts = group_frames(names)
@@ -38,7 +38,7 @@ def test_a_bag_whose_frames_are_named_by_time_is_one_drive(count):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 40))
-def test_an_interval_holds_the_score_and_repeats_itself(seed, count):
+def test_interval_contains_score_and_is_repeatable(seed, count):
     values = np.random.default_rng(seed).normal(0, 1, count)
     parts = [np.array([i]) for i in range(count)]
     low, high = compute_interval(lambda frames: values[frames].mean(), parts, 300)
@@ -49,7 +49,7 @@ def test_an_interval_holds_the_score_and_repeats_itself(seed, count):
     assert compute_interval(lambda frames: None, parts, 10) is None
 
 
-def test_frames_of_one_drive_that_are_alike_do_not_narrow_it():
+def test_repeated_frames_of_a_drive_keep_interval_wide():
     """Ten frames of a drive say no more than one."""
     person, elsewhere = np.array([[10.0, 0, 0, 1, 1, 2, 0]]), np.array([[20.0, 0, 0, 1, 1, 2, 0]])
     once, often = CentreScores(), CentreScores()

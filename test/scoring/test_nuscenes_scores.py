@@ -55,7 +55,7 @@ def test_everything_found_scores_one():
     assert summarize({"car": s})["nds"] == pytest.approx(1)
 
 
-def test_the_best_without_velocities_and_attributes_is_0_8():
+def test_best_nds_without_velocities_and_attributes_is_0_8():
     s = scored(boxes(*ROW, velocities=1.0, attributes=6), boxes(*ROW, scores=0.5))
     assert (s.errors["ave"], s.errors["aae"]) == (1, 1)
     assert summarize({"car": s})["nds"] == pytest.approx(0.8)
@@ -73,7 +73,7 @@ def test_recall_up_to_0_1_counts_nothing():
     assert s.mean_ap == 0 and set(s.errors.values()) == {1.0}
 
 
-def test_a_better_scored_false_one_takes_precision():
+def test_false_positive_of_higher_score_lowers_precision():
     """Precision is read off between (recall 0, 0) and (1, 0.5): r / 2, of which the part above 0.1
     is (16.2 / 90) in the mean over the recalls, out of 0.9."""
     s = scored(boxes((0, 0)), boxes((30, 0), (0, 0), scores=[0.9, 0.8]))
@@ -106,7 +106,7 @@ def test_objects_of_other_frames_are_not_found():
     assert scored(truth, found, true_frames=[0, 3], found_frames=[1, 2]).mean_ap == 0
 
 
-def test_nothing_found_or_nothing_there_is_zero_and_errors_of_one():
+def test_no_detections_or_labels_give_ap_0_and_errors_1():
     for truth, found in ((boxes((0, 0)), boxes()), (boxes(), boxes((0, 0), scores=1.0)),
                          (boxes(), boxes())):
         s = scored(truth, found)
@@ -129,7 +129,7 @@ def test_errors_of_a_pair():
     assert np.isnan(compute_errors(boxes((0, 0)), found, False)["aae"])
 
 
-def test_the_error_is_a_mean_of_means_over_recall():
+def test_error_is_a_mean_of_means_over_recall():
     """Two objects, errors 0 and 1 by falling score. Recalls 0.11 .. 0.5 have the first error,
     0.51 .. 1 one that rises from 0 to the mean of both, 0.5, in 50 steps."""
     s = scored(boxes((0, 0), (20, 0)), boxes((0, 0), (21, 0), scores=[0.9, 0.8]))

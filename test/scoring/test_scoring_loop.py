@@ -95,7 +95,7 @@ def test_run_error_ends_the_run_and_keeps_earlier_results(root, jobs):
     assert report.names == ["000000", "000001"][:len(report.names)]
 
 
-def test_a_command_whose_run_ends_says_so_in_one_line(root, tmp_path, monkeypatch, capsys):
+def test_failed_run_is_reported_in_one_line(root, tmp_path, monkeypatch, capsys):
     (tmp_path / "found").mkdir()
     for jobs in 1, 2:
         assert exit_of(monkeypatch, "evaluate", "detection", "--data", root, "--results",
@@ -105,7 +105,7 @@ def test_a_command_whose_run_ends_says_so_in_one_line(root, tmp_path, monkeypatc
         [*measure_frames(open_recording(root), partial(measure_result_files, tmp_path / "found"))]
 
 
-def test_a_mistake_is_no_skipped_frame_and_names_it(root):
+def test_programming_error_is_raised_with_frame_name(root):
     def mistaken(recording):
         return lambda frame: 1 // (frame.name != "000002")
     with pytest.raises(ZeroDivisionError) as error:
@@ -116,7 +116,7 @@ def test_a_mistake_is_no_skipped_frame_and_names_it(root):
 @pytest.mark.parametrize("limit, expected", [
     (None, ["000000", "000002", "000004"]), (1, ["000000"]), (3, ["000000", "000002"]),
     (99, ["000000", "000002", "000004"])])
-def test_a_limit_is_of_frames_and_no_other_is_touched(root, limit, expected):
+def test_limit_reads_no_other_frames(root, limit, expected):
     touched = []
 
     def noting(recording):
@@ -141,13 +141,13 @@ def test_start_and_each_measurement_run_once_and_lazily(root):
     assert len([*found]) == COUNT - 1 and len(called) == 1 + COUNT
 
 
-def test_a_recording_that_cannot_be_opened_again_is_measured_here(root):
+def test_recording_without_reopen_needs_one_process(root):
     recording = replace(open_recording(root), reopen=None)
     assert len([*measure_frames(recording, counting)]) == COUNT
 
 
 @given(st.sets(st.integers(0, 20)), st.randoms(use_true_random=False))
-def test_pairs_come_in_order_each_as_soon_as_it_can(numbers, random):
+def test_results_are_sorted_and_yielded_early(numbers, random):
     numbers = sorted(numbers)
     sent, taken = random.sample(numbers, len(numbers)), []
 

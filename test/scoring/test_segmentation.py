@@ -71,7 +71,7 @@ def some(seed):
     return found, objects(owner, region, counted=rng.random(300) < 0.9)
 
 
-def test_perfect_clusters_are_perfect_everywhere():
+def test_perfect_clusters_have_perfect_scores():
     owner = np.repeat([0, 1, 2, 3], [40, 10, 20, 30])
     content = report_of(owner, objects(owner, ranges=np.array([10.0, 20.0, 50.0])))
     assert [content[k] for k in ("precision", "f1")] == [1, 1]
@@ -135,7 +135,7 @@ def test_neutral_points_are_neutral_for_their_object_only():
 
 
 @pytest.mark.parametrize("counted", [0, 10, 20])
-def test_clusters_of_which_no_point_counts_are_not_judged(counted):
+def test_clusters_of_uncounted_points_are_not_judged(counted):
     """The last ones, or all of them: as of labels that say of most points nothing."""
     truth = objects(np.repeat([1, 0, 2], 10), near=np.ones(30), counted=np.arange(30) < counted)
     assert score_clusters(np.repeat([1, 2, 3], 10), truth).judged == counted / 10
@@ -154,7 +154,7 @@ def test_order_of_points_and_numbers_of_clusters_do_not_matter(seed):
 
 
 @given(seeds)
-def test_scores_are_those_of_a_plain_loop_over_sets(seed):
+def test_scores_equal_a_plain_loop_over_sets(seed):
     found, truth = some(seed)
     score = score_clusters(found, truth)
     keep = truth.counted
@@ -321,7 +321,7 @@ def test_a_broken_folder_gives_one_line_with_a_remedy(tmp_path, root, file, cont
 
 
 @needs_data
-def test_the_real_scan_has_a_label_for_every_point():
+def test_real_scan_has_a_label_for_every_point():
     first = open_recording(DATA / "semantickitti").frames[0]
     frame, labels = first.load(), first.point_truth()
     semantic, instance = labels.classes, labels.instances
@@ -367,7 +367,7 @@ def test_methods_and_frames_can_be_chosen(tmp_path):
     assert png.read_bytes().startswith(b"\x89PNG")
 
 
-def test_calls_that_cannot_be_answered_say_why(tmp_path):
+def test_invalid_calls_name_the_reason(tmp_path):
     root = semantic_folder(tmp_path / "semantic", ["00/000000"])
     kitti = object_folder(tmp_path / "kitti")
     for arguments, text in (([], "DATA is missing"),
@@ -382,7 +382,7 @@ def test_calls_that_cannot_be_answered_say_why(tmp_path):
 
 
 @pytest.mark.parametrize("command", [segmentation, candidates])
-def test_a_bag_whose_sensor_is_lower_is_scored_alike(command, tmp_path):
+def test_bag_of_a_lower_sensor_scores_equally(command, tmp_path):
     """Its height is measured, and what is scored is told so, unless flags say another one."""
     def scores(name, lower, *flags):
         path, bag = tmp_path / f"{name}.json", tmp_path / name

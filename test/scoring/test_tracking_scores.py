@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from lidar_perception.scoring.tracking.pairs import (
 from lidar_perception.scoring.tracking.report import TrackingReport, measure_tracking, observe
 from lidar_perception.scoring.tracking.tables import print_tracking_report
 from lidar_perception.simulation.camera import FORWARD_CAMERA
+from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError, PointCloud
 
 CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
@@ -125,7 +127,7 @@ def test_the_order_in_which_frames_come_does_not_matter():
     assert scored(frames, order=[9, 3, 1, 0, 2, 8, 7, 4, 5, 6]) == scored(frames)
 
 
-def test_drives_that_share_a_bag_are_scored_as_if_they_had_names():
+def test_unnamed_drives_of_a_bag_score_like_named_ones():
     """Labels of each have numbers of their own."""
     def content(named):
         frames, found = [], {}
@@ -138,22 +140,24 @@ def test_drives_that_share_a_bag_are_scored_as_if_they_had_names():
                                        index=i if named else len(frames)))
         recording, report = Recording("a", "", frames), TrackingReport()
         fill(report, recording,
-             measure_tracking(lambda: lambda scan: found[scan.stamp_ns], ego="none"))
+             partial(measure_tracking, lambda: lambda scan: found[scan.stamp_ns],
+                     TrackingParams(), "none"))
         return report.compute()
 
     assert content(False) == content(True)
     assert content(False)["sequences"] == 2 and content(False)["classes"]["Car"]["switches"] == 0
 
 
-def test_frames_whose_pose_is_not_known_are_counted_and_said(capsys):
+def test_frames_without_pose_are_counted_and_reported(capsys):
     poses = [np.eye(4), None, None]
     frames = [Frame.of(f"a/{i}", PointCloud(np.ones((1, 3), np.float32), None, 10**8 * (i + 1)),
                        truth, sequence="a", index=i, pose=lambda i=i: poses[i])
               for i, (truth, _) in enumerate(drive(frames=3))]
     for ego, unknown in ("recording", 2), ("none", 0):
         report = TrackingReport()
-        fill(report, Recording("a", "", frames), measure_tracking(
-            lambda: lambda scan: DetectionResult(Detections.none()), ego=ego))
+        fill(report, Recording("a", "", frames), partial(
+            measure_tracking, lambda: lambda scan: DetectionResult(Detections.none()),
+            TrackingParams(), ego))
         print_tracking_report({"ego": ego, **report.compute()}, Console(width=200))
         assert report.compute()["without_pose"] == unknown
         said = capsys.readouterr().out
@@ -202,7 +206,8 @@ def test_what_cannot_be_scored_says_why():
         make_pairs(GroundTruth.of(truth.boxes, truth.class_ids), tracks, None)
     frame = Frame("a/0", 0, lambda: 1 / 0, lambda: GroundTruth.of(
         truth.boxes, truth.class_ids, [{"track_id": -1}] * len(truth)))  # as KITTI writes none
-    measure = measure_tracking(lambda: None, ego="none")(Recording("a", "", [frame], frozenset()))
+    measure = measure_tracking(lambda: None, TrackingParams(), "none",
+                               Recording("a", "", [frame], frozenset()))
     with pytest.raises(InputError, match="no track id"):  # before the scan is loaded
         measure(frame)
     with pytest.raises(InputError, match="needs a calibration"):

@@ -26,7 +26,7 @@ def test_three_hits_make_a_track_and_two_misses_end_it():
     assert shown == [0, 0, 1, 1, 0, 0]
 
 
-def test_it_follows_a_straight_way_and_poses_make_what_stands_stand():
+def test_plain_tracker_follows_car_and_compensates_poses():
     tracker = PlainAb3dmot()
     for i in range(20):
         pose = np.eye(4)
@@ -47,7 +47,7 @@ def test_both_trackers_are_scored_on_the_same_frames():
         assert car["HOTA"] > 0.8
 
 
-def test_a_recording_with_track_ids_is_tracked_by_both_and_one_without_by_none(monkeypatch):
+def test_only_recordings_with_track_ids_are_tracked(monkeypatch):
     from types import SimpleNamespace
 
     from benchmark import tracking

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
 pytestmark = pytest.mark.no_cover  # other tests cover these lines
@@ -32,10 +34,12 @@ def test_no_id_switches_on_real_drive(data, detector, ego):
     from lidar_perception.scoring.tracking.report import TrackingReport, measure_tracking
     from lidar_perception.tracking.drive_tracker import choose_ego_source
     from lidar_perception.tracking.ego import has_odometry
+    from lidar_perception.tracking.params import TrackingParams
 
     report, drive = TrackingReport(), open_recording(data / "kitti_tracking")
     if ego == "auto" and POSES not in drive.has:
         assert choose_ego_source(drive) == ("kiss_icp" if has_odometry() else "none")
-    fill(report, drive, measure_tracking(lambda: detector, ego=ego), limit=FRAMES)
+    fill(report, drive, partial(measure_tracking, lambda: detector, TrackingParams(), ego),
+         limit=FRAMES)
     cars = report.compute()["classes"]["Car"]
     assert cars["switches"] == 0 and cars["HOTA"] > 0.7

@@ -91,7 +91,7 @@ class DetectionRequest:
             return partial(measure_result_files, self.results)
         open_detector = partial(self.detector.open, min_score=self.min_score,
                                 sensor_height=recording.frames[0].sensor_height)
-        return measure_detector(open_detector, self.keep, self.write_results)
+        return partial(measure_detector, open_detector, self.keep, self.write_results)
 
     def compute(self, report: Any) -> dict[str, Any]:
         """Return the scores of a report as JSON."""

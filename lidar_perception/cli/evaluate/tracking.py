@@ -47,7 +47,7 @@ def tracking(options: ScoringOptions, detector: DetectorChoice, tracking: Tracki
         console.print(Text("no pose", "yellow") + ": the first frames have none, so poses are by "
                       "KISS-ICP; see whether the odometry or TF of the recording has the clock of "
                       "its clouds")
-    options.fill(report, recording, measure_tracking(open_detector, tracking, source))
+    options.fill(report, recording, partial(measure_tracking, open_detector, tracking, source))
     if not report.frames:
         raise no_labels_error(recording, report.skipped)
     content = {"source": detector.weights, "ego": source, **report.compute()}

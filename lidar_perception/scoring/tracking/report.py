@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 from lidar_perception.camera import Calibration
 from lidar_perception.classes import DETECTED
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.contract import Detector
-from lidar_perception.scoring.run import Start
 from lidar_perception.scoring.tracking.clear import ClearCounts, count_clear
 from lidar_perception.scoring.tracking.hota import HotaCounts, count_hota
 from lidar_perception.scoring.tracking.over_recall import score_over_recall
@@ -51,17 +49,13 @@ def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
         raise InputError(f"{sequence}/{index}: {error}") from None
 
 
-def measure_tracking(open_: Callable[[], Detector], params: TrackingParams = TrackingParams(),
-                     ego: str = "auto") -> Start:
-    """Make a Start that tracks the detections of open_(), see DriveTracker.
+def measure_tracking(open_: Callable[[], Detector], params: TrackingParams, ego: str,
+                     recording: Recording) -> Callable[[Frame], Observation | None]:
+    """Make a function that tracks the detections of open_(), see DriveTracker.
 
-    Frames must be measured in order of time, in one process.
+    Frames must be measured in order of time, in one process. partial(measure_tracking, open_,
+    params, ego) is a Start of scoring.run.
     """
-    return partial(_measure_tracking, open_, params, ego)
-
-
-def _measure_tracking(open_: Callable[[], Detector], params: TrackingParams, ego: str,
-                      recording: Recording) -> Callable[[Frame], Observation | None]:
     tracker = DriveTracker(recording, params, ego)
     detector = open_()
 
