@@ -24,7 +24,7 @@ ID, SCORE, REST = "track_id", "score", "rest"  # keys of Track.extra
 def to_tracks(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str, Any]]:
     """Convert labels to accepted tracks of key boxes, with ids from first_id on, and State.kept.
 
-    Boxes with the same track id and class form a track; a box without an id is a track of its own.
+    Boxes with the same track id and class form a track; a box without an id is a separate track.
     """
     found: dict[tuple[Any, ...], tuple[str, dict[int, Box], dict[int, dict[str, Any]]]] = {}
     for f, frame in enumerate(labels.frames):

@@ -20,10 +20,17 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Qos
 
-from lidar_perception.data.bag_metadata import NAME, add_differences, read_metadata
+from lidar_perception.data.bag_metadata import (
+    LATCHED_QOS,
+    NAME,
+    SENSOR_QOS,
+    add_differences,
+    complete_profile,
+    parse_profiles,
+    read_metadata,
+)
 from lidar_perception.data.mcap_file import NO_INDEX
 from lidar_perception.data.open_storage import describe_damage, find_files, open_file
-from lidar_perception.data.qos import LATCHED_QOS, SENSOR_QOS, complete_profile, parse_profiles
 from lidar_perception.data.record_file import RecordFile
 from lidar_perception.data.ros1_bag import Ros1File
 from lidar_perception.data.storage import END, START, StorageFile, Topic, merge_streams
@@ -35,7 +42,7 @@ from lidar_perception.wire.compression import decompress_message
 
 __all__ = ["LATCHED_QOS", "SENSOR_QOS", "Bag", "BagHandle", "BagWriter"]
 
-# A KITTI cloud has 1.9 MB. Chunks of several clouds compress better and are read in fewer steps.
+# A KITTI cloud has 1.9 MB. Chunks of several clouds compress better and are faster to read.
 CHUNK_BYTES = 8 * 2**20
 MAX_SHOWN = 3  # differences between metadata.yaml and the files that a warning lists
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4,
@@ -62,10 +69,9 @@ def _to_yaml(content: Any) -> str:
 class BagWriter:
     """Writer of a rosbag2 folder with one MCAP file, checksums and metadata.yaml.
 
-    A context manager. Only one process can write a bag at a time. The folder gets its name when it
-    is complete. After an exception, the messages written so far are kept in a valid bag
-    NAME.incomplete. InputError if the disk is full; NAME.incomplete then holds the messages that
-    fit.
+    A context manager. The folder is named NAME.incomplete until it is complete, and only one
+    process can write it. After an exception, it stays as a valid bag with the messages written so
+    far. InputError if the disk is full.
 
     Args:
         path: folder of the bag.
@@ -115,14 +121,12 @@ class BagWriter:
         definition, _ = load_typestore().generate_msgdef(type_name, ros_version=2)
         schema = self.mcap.register_schema(type_name, "ros2msg", definition.encode())
         profile = [complete_profile(qos)]
-        metadata = {"offered_qos_profiles": _to_yaml(profile),
-                    "topic_type_hash": load_typestore().hash_rihs01(type_name)}
-        channel = self.mcap.register_channel(topic, "cdr", schema, metadata)
-        self.channels[topic] = channel
+        digest = load_typestore().hash_rihs01(type_name)
+        self.channels[topic] = self.mcap.register_channel(topic, "cdr", schema, {
+            "offered_qos_profiles": _to_yaml(profile), "topic_type_hash": digest})
         self.topics.append({"topic_metadata": {
             "name": topic, "type": type_name, "serialization_format": "cdr",
-            "offered_qos_profiles": profile,
-            "type_description_hash": load_typestore().hash_rihs01(type_name)}, "message_count": 0})
+            "offered_qos_profiles": profile, "type_description_hash": digest}, "message_count": 0})
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Append a message: an object of bag_message, or CDR bytes."""
@@ -138,7 +142,7 @@ class BagWriter:
             try:
                 self._finish()
             except OSError:
-                # An MCAP file may lack an index, and a bag may lack metadata.
+                # A bag without an index and without metadata.yaml is still valid.
                 self.file.close_with(NO_INDEX)
                 (self.partial / "metadata.yaml").unlink(missing_ok=True)
                 if kind is None:
@@ -173,20 +177,20 @@ class Bag:
     """A bag open for reading; a context manager.
 
     A bag is a rosbag2 folder, a folder of ROS 1 bags, or one storage file. Topics, counts and times
-    are those of its files; an InputWarning lists contradictions in metadata.yaml.
+    come from its files; an InputWarning lists differences to metadata.yaml.
 
     Args:
-        warn: False to suppress these warnings, for a bag that was opened before.
+        warn: False to suppress these warnings.
 
     Attributes:
         topics: type of each readable topic, by its name.
         counts: number of messages of each readable topic, by its name.
-        unreadable: topics in an unsupported encoding, by their names.
+        unreadable: topics in an unsupported encoding, by name.
         start_ns, end_ns: time of the first message, and after the last one; 0 without messages.
 
     Raises:
         InputError: the bag is damaged, or the path is not a bag. Checksums and counts are verified;
-            damage in a file without checksums may go unnoticed.
+            damage in a file without checksums may not be detected.
     """
 
     def __init__(self, path: str | Path, *, warn: bool = True):
@@ -265,16 +269,16 @@ class Bag:
             {**others, **self.topics}.items())) or "nothing"
 
     def qos(self, topic: str) -> list[Qos]:
-        """Return the QoS profiles that a topic was recorded with; an empty list if unknown.
+        """Return the recorded QoS profiles of a topic, those of metadata.yaml first; [] if unknown.
 
-        Profiles in metadata.yaml take precedence, as people edit them for `ros2 bag play`.
+        People edit metadata.yaml for `ros2 bag play`.
         """
         return parse_profiles(self._offered.get(topic)) or list(dict.fromkeys(
             profile for _, file in self.files for each in file.topics if each.name == topic
             for profile in parse_profiles(each.qos)))
 
     def require(self, topic: str) -> None:
-        """Raise InputError that lists the available topics if the bag lacks a topic."""
+        """Raise InputError, with the available topics, if the bag lacks a topic."""
         if other := self.unreadable.get(topic):
             raise InputError(f"{self.path} has {other.type} as {other.encoding} on {topic}; this "
                              "encoding is not supported: record it with ROS 2")
@@ -290,8 +294,8 @@ class Bag:
             start_ns, stop_ns: only messages with start_ns <= time < stop_ns.
 
         Raises:
-            InputError: the bag is damaged. A number of messages other than declared is detected at
-                the end of a file.
+            InputError: the bag is damaged. A wrong number of messages is detected at the end of a
+                file.
         """
         wanted = self.topics.keys() & (self.topics if topics is None else {*topics})
         start, stop = START if start_ns is None else start_ns, END if stop_ns is None else stop_ns
@@ -328,11 +332,10 @@ class Bag:
 
 
 class BagHandle:
-    """A bag that is opened once and stays open, for reading single messages.
+    """A bag that stays open, for reading single messages without reading its index again.
 
-    Opening a bag takes as long as reading its index, which grows with the bag. Each process and
-    each thread has its own open bag, as SQLite requires; it is closed with the thread, or when the
-    handle is deleted. Only the first one warns.
+    Each process and each thread has its own open bag, as SQLite requires; it is closed with the
+    thread, or when the handle is deleted. Only the first one warns.
     """
 
     def __init__(self, path: Path, warn: bool = True):

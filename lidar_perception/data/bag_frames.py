@@ -50,7 +50,7 @@ from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, INSTANCE, POIN
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import SECOND_NS
 
-# Topics that a bag needs for each kind of content
+# Required topics by content
 TOPICS_BY_CONTENT = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}}
 
 
@@ -62,7 +62,7 @@ def is_layout(path: Path) -> bool:
 
 
 def choose_cloud_topic(bag: Bag, points: str = "") -> str:
-    """Return the topic to read clouds from: `points` if given, else /points, else the only one.
+    """Choose the topic of the clouds: `points` if given, else /points, else the only one.
 
     Raises InputError if there is no such topic, or if the choice is ambiguous.
     """
@@ -106,8 +106,8 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
 class BagFrames(Sequence):
     """The frames of a bag in order of time; native() of a frame returns its message.
 
-    Iterating reads the bag once, and each frame holds its cloud; so does frame 0. Any other frame
-    that is accessed by index reads its cloud when it is needed. The first such access reads the
+    When iterating, the bag is read once, and each frame holds its cloud. A frame that is accessed
+    by index, except the first one, reads its cloud when needed; the first such access reads the
     times of all clouds.
     """
 
@@ -138,7 +138,7 @@ class BagFrames(Sequence):
                 yield self._make_frame(i, time, stamp, names[stamp], partial(bytes, data))
 
     def stamps(self) -> np.ndarray:
-        """Return the stamps (count,) int64 ns of all clouds. Reads the whole bag once."""
+        """Return the stamps (count,) int64 ns of all clouds; the whole bag is read once."""
         return np.array([row[2] for row in self._index], np.int64)
 
     def message(self, i: int) -> Any:
@@ -160,8 +160,8 @@ class BagFrames(Sequence):
 
     @cached_property
     def _index(self) -> list[tuple[int, int, int, int]]:
-        """Per cloud: time, number of earlier clouds with the same time, stamp, and number of clouds
-        with the same stamp up to this one."""
+        """Time, number of earlier clouds of this time, stamp, and number of clouds of this stamp so
+        far, for each cloud."""
         times: Counter[int] = Counter()
         names: Counter[int] = Counter()
         rows = []
@@ -178,7 +178,7 @@ class BagFrames(Sequence):
 
     @cached_property
     def _annotations(self) -> tuple[dict[int, GroundTruth], list, list]:
-        """Labels by stamp, and calibrations and transforms by time.
+        """Labels by stamp, and calibrations and transforms by time, of the whole bag.
 
         They are small, and may come after their cloud.
         """
@@ -190,7 +190,7 @@ class BagFrames(Sequence):
             if topic == TRUTH:
                 objects = from_marker_array(msg)
                 truth[objects.stamp_ns or time] = to_truth(objects)
-                if not objects.stamp_ns:  # a cloud without a stamp, or the start of simulated time
+                if not objects.stamp_ns:  # no stamp, or the start of simulated time
                     truth.setdefault(0, truth[time])
             else:
                 (infos if topic == CAMERA_INFO else transforms).append((time, msg))
@@ -211,11 +211,8 @@ class BagFrames(Sequence):
         return next(((time, bytes(data)) for _, time, data in raw), None)
 
     def _stamp(self, data: bytes, time: int) -> int:
-        """Return header.stamp of a serialized cloud, in ns.
-
-        If all clouds of the bag lack a stamp, or the message is too short, return its time in the
-        bag.
-        """
+        """Return header.stamp of a serialized cloud in ns; its time in the bag if all clouds lack a
+        stamp, or if the message is too short."""
         if (stamp := _read_header_stamp(data)) == 0 and self._has_no_stamps:
             stamp = None
         return time if stamp is None else stamp
@@ -228,15 +225,15 @@ class BagFrames(Sequence):
 
     @cached_property
     def full_scale(self) -> float:
-        """Intensity of a full reflection, from the first clouds; the same for all frames.
+        """Intensity of a full reflection, the same for all frames.
 
-        The first clouds are the only ones that are read without reading the whole bag.
+        It is inferred from the first clouds, as others would require reading the whole bag.
         """
         return infer_scale(self._first_clouds(),
                            lambda data: read_raw_intensity(decode_cloud(data, self.kind)))
 
     def _first_clouds(self) -> Iterator[bytes]:
-        with suppress(InputError):  # damage is reported when the frame is read
+        with suppress(InputError):  # reported when the frame is read
             for _, _, data in islice(self.handle.bag().raw_messages({self.points}), MAX_READ):
                 yield bytes(data)
 
@@ -310,7 +307,6 @@ def _read_frame_id(data: bytes) -> str:
 
 
 def _find_latest(messages: list, time: int) -> Any:
-    """Return the last message up to a time, or the first one: latched topics hold from the
-    start."""
+    """Return the last message up to a time, else the first one, as for latched topics."""
     after = bisect_right(messages, time, key=itemgetter(0))
     return messages[max(after - 1, 0)][1] if messages else None

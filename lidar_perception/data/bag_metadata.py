@@ -1,7 +1,8 @@
-"""Reading of rosbag2's metadata.yaml, versions 1 to 9, which is often incomplete or wrong.
+"""Reading of rosbag2's metadata.yaml, versions 1 to 9, and of QoS profiles.
 
-People edit it, `ros2 bag reindex` recreates it, and it may be left over from other files. Therefore
-only the names of the files and the QoS are taken from it; the rest is compared with the files.
+The file is often incomplete or wrong: people edit it, `ros2 bag reindex` recreates it, and it may
+belong to other files. So only file names and QoS are taken from it; the rest is compared with the
+files.
 """
 
 from __future__ import annotations
@@ -9,9 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, cast
 
 import yaml
+from rosbags.interfaces import Qos
+from rosbags.rosbag2.metadata import parse_qos
 
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
@@ -19,6 +22,15 @@ from lidar_perception.types import InputError
 NAME = "metadata.yaml"
 MAX_BYTES = 2**26
 TOLERANCE_NS = 10**6  # between times in metadata.yaml and in the files
+
+# Keys and values of rosbag2. Late subscribers get the last message of a latched topic.
+SENSOR_QOS = dict(history="keep_last", depth=10, reliability="reliable", durability="volatile")
+LATCHED_QOS = dict(history="keep_last", depth=1, reliability="reliable",
+                   durability="transient_local")
+
+_INFINITE = {"sec": 9223372036, "nsec": 854775807}
+_OTHER_POLICIES = {"deadline": _INFINITE, "lifespan": _INFINITE, "liveliness": "automatic",
+                   "liveliness_lease_duration": _INFINITE, "avoid_ros_namespace_conventions": False}
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # faster, but optional
 
 
@@ -32,7 +44,7 @@ class Metadata:
         qos: offered profiles by topic, as YAML text or parsed.
         start_ns, duration_ns: None if not given.
         compression: format of compressed files or messages, "" without compression.
-        problems: one sentence per error in the file.
+        problems: errors in the file, one sentence each.
     """
 
     files: list[str] = field(default_factory=list)
@@ -72,10 +84,7 @@ def read_metadata(folder: Path) -> Metadata:
 
 def add_differences(metadata: Metadata, counts: Mapping[str, int], start_ns: int,
                     duration_ns: int) -> None:
-    """Compare the metadata with the message counts and times of the files.
-
-    Adds a sentence to metadata.problems for each difference.
-    """
+    """Add each difference to the message counts and times of the files to metadata.problems."""
     for topic, (_, count) in metadata.topics.items():
         if count != counts.get(topic, 0):
             metadata.problems.append(f"it declares {count} messages on {topic}, the files have "
@@ -94,3 +103,25 @@ def _read_number(tree: Mapping[str, Any], *keys: str) -> int:
     if isinstance(tree, int):
         return tree
     raise ValueError(f"{tree!r} for {' '.join(keys)}")
+
+
+def complete_profile(qos: dict[str, Any]) -> dict[str, Any]:
+    """Return a profile such as SENSOR_QOS with all policies that rosbag2 writes."""
+    return {**qos, **_OTHER_POLICIES}
+
+
+def parse_profiles(given: Any) -> list[Qos]:
+    """Return the profiles of a topic, given as YAML text or parsed; [] if they cannot be parsed.
+
+    Only history, depth, reliability and durability are read. Writers represent durations in many
+    ways (numbers, "infinite", left out), and nodes do not need them.
+    """
+    try:
+        profiles = yaml.safe_load(given) if isinstance(given, str) else given
+        # rosbags requires all policies (rosbags/rosbag2/metadata.py, parse_qos).
+        return parse_qos(cast(Any, [
+            {**SENSOR_QOS, **{key: profile[key] for key in SENSOR_QOS
+                              if isinstance(profile.get(key), str | int)}, **_OTHER_POLICIES}
+            for profile in profiles or ()]))
+    except (yaml.YAMLError, AttributeError, TypeError, ValueError):
+        return []

@@ -26,17 +26,14 @@ from lidar_perception.wire.transforms import (
 from msg_utils.markers import MarkedObjects
 
 FILTERED = "/odometry/filtered"  # of robot_localization
-MIN_TF_MESSAGES = 500  # of /tf, read to learn the frames above the sensor
-MAX_GAP_S = 0.5        # between two poses, before the first and after the last
+MIN_TF_MESSAGES = 500  # of /tf that are read to find the frames above the sensor
+MAX_POSE_GAP_S = 0.5   # between two poses, before the first and after the last
 
 
 def choose_odometry_topic(topics: Mapping[str, str]) -> str:
-    """Return the topic with the odometry: /odom, else /odometry/filtered, else the only one.
+    """Choose the odometry topic: /odom, else /odometry/filtered, else the only one, else "".
 
-    "" if there is none, or if the choice is ambiguous.
-
-    Args:
-        topics: type of each topic, by its name.
+    topics: types by name.
     """
     odometry_topics = [name for name, kind in topics.items() if kind == ODOMETRY_MESSAGE]
     usual = [name for name in (ODOMETRY, FILTERED) if name in odometry_topics]
@@ -46,10 +43,10 @@ def choose_odometry_topic(topics: Mapping[str, str]) -> str:
 class BagPoses:
     """Poses of the clouds' frame in a fixed frame, interpolated at any time.
 
-    The choice of the source is that of a live tracker with ego.source auto. With odometry: the
-    odometry, and TF from its child frame to the sensor; if TF does not connect the two, they are
-    taken as the same place. Without odometry: TF alone, in odom if that is above the sensor, else
-    in the topmost frame that the sensor moves in.
+    The source is chosen as by the tracker with ego.source auto. With odometry, it is the odometry
+    and TF from its child frame to the sensor; if TF does not connect the two, they are assumed to
+    coincide. Without odometry, it is TF, in odom if that is above the sensor, else in the topmost
+    frame in which the sensor moves.
     """
 
     def __init__(self, handle: BagHandle, frame_id: str):
@@ -79,7 +76,7 @@ class BagPoses:
         if not self.fixed:
             raise MissingTransform(f"{self.path} has neither odometry nor a TF in which "
                                    f"'{self.frame_id}' moves; record one of them")
-        return self._tree.lookup_many(self.fixed, self.frame_id, times, MAX_GAP_S)
+        return self._tree.lookup_many(self.fixed, self.frame_id, times, MAX_POSE_GAP_S)
 
     @cached_property
     def available(self) -> bool:
@@ -88,8 +85,7 @@ class BagPoses:
 
     @property
     def needs_no_tf(self) -> bool:
-        """True if nodes need no TF: without poses, or if /odom is the odometry of the sensor
-        itself."""
+        """True if nodes need no TF, as there are no poses or /odom is the sensor's own odometry."""
         return not self.available or (self.odometry == ODOMETRY
                                       and self.odometry_child == self.frame_id)
 
@@ -105,16 +101,13 @@ class BagPoses:
 
     @cached_property
     def fixed(self) -> str:
-        """Frame of TF that the sensor moves in; "" if nothing above the sensor moves."""
+        """TF frame in which the sensor moves; "" if nothing above the sensor moves."""
         moving = [self._above[i + 1] for i, frame in enumerate(self._above[:-1])
                   if not self._first_transforms.is_fixed(frame)]
         return ODOMETRY_FRAME if ODOMETRY_FRAME in moving else moving[-1] if moving else ""
 
     def find_mount(self, base: str) -> np.ndarray | None:
-        """Return the fixed pose (4, 4) of the sensor in a frame of the robot.
-
-        None if TF does not connect the two, or if the sensor moves in that frame.
-        """
+        """Return the pose (4, 4) of the sensor in a frame of the robot; None if it is not fixed."""
         base_chain = self._list_parents(base)
         common = next((frame for frame in self._above if frame in base_chain), None)
         if common is None or not all(map(self._first_transforms.is_fixed, (
@@ -124,8 +117,8 @@ class BagPoses:
 
     @property
     def base(self) -> str:
-        """Frame of the robot: the child frame of the odometry, else the highest frame above the
-        sensor in which it is fixed; "" if TF has none."""
+        """Frame of the robot: the odometry's child frame, else the topmost frame in which the
+        sensor is fixed; "" without TF."""
         if self.odometry_child and self.odometry_child != self.frame_id:
             return self.odometry_child
         # Stop at the first moving link: above it, odom may be fixed in a map.
@@ -139,7 +132,7 @@ class BagPoses:
         """
         if self.odometry and frame_id.lstrip("/") == self._first.header.frame_id.lstrip("/"):
             return invert_pose(self.lookup(np.array([stamp_ns]))[0])
-        return self._tree.lookup(self.frame_id, frame_id, stamp_ns, MAX_GAP_S)
+        return self._tree.lookup(self.frame_id, frame_id, stamp_ns, MAX_POSE_GAP_S)
 
     def to_cloud_frame(self, objects: MarkedObjects, topic: str) -> MarkedObjects:
         """Return objects with their boxes transformed to the clouds' frame at their stamp.
@@ -166,19 +159,16 @@ class BagPoses:
         return self._odometry_poses(np.array([stamp_ns]))[0]
 
     def _odometry_poses(self, times: np.ndarray) -> np.ndarray:
-        return self._odometry.lookup_many(FIXED, MOVING, times, MAX_GAP_S)
+        return self._odometry.lookup_many(FIXED, MOVING, times, MAX_POSE_GAP_S)
 
     def _sensor_in_odometry_child(self, times: np.ndarray) -> np.ndarray:
-        """Return the pose of the sensor in the child frame of the odometry.
-
-        (4, 4) if it is fixed, else (M, 4, 4) at times (M,) ns; identity if TF does not connect
-        them.
-        """
+        """Return the pose of the sensor in the child frame of the odometry: (4, 4) if it is fixed,
+        else (M, 4, 4) at times (M,) ns; identity without TF."""
         if not {*self._above} & {*self._list_parents(self.odometry_child)}:
             return np.eye(4)
         if (pose := self.find_mount(self.odometry_child)) is not None:
             return pose
-        return self._tree.lookup_many(self.odometry_child, self.frame_id, times, MAX_GAP_S)
+        return self._tree.lookup_many(self.odometry_child, self.frame_id, times, MAX_POSE_GAP_S)
 
     @cached_property
     def _odometry(self) -> TransformTree:
@@ -192,7 +182,7 @@ class BagPoses:
 
     @cached_property
     def _first_transforms(self) -> TransformTree:
-        """Static transforms, and the first moving ones, until something above the sensor moves."""
+        """Static transforms, and moving ones until a frame above the sensor moves."""
         tree = TransformTree(keeps_all=True)
         bag = self.handle.bag()
         for _, _, msg in bag.messages({TF_STATIC} & self.transforms):
@@ -200,7 +190,7 @@ class BagPoses:
         for i, (_, _, msg) in enumerate(bag.messages({TF} & self.transforms)):
             if i >= MIN_TF_MESSAGES and (self.odometry or not all(map(tree.is_fixed, _find_chain(
                     tree, self.frame_id)))):
-                break  # wheels may turn for a long time before the robot is localised
+                break  # for a long time, only wheels may move
             self._add(tree, msg, False)
         return tree
 

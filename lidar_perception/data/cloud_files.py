@@ -25,7 +25,7 @@ KITTI = "x y z intensity"
 MAX_COLUMNS = 16  # of a .npy file; an array with more is probably transposed
 MAX_RING = 256
 SAMPLE_SIZE = 2000  # points from which the columns of a .bin file are inferred
-MAX_NEGATIVE_SHARE = 0.1  # of the sample; with more negative intensities the columns are others
+MAX_NEGATIVE_SHARE = 0.1  # of the intensities in the sample, if the columns are as assumed
 REFLECTANCE = ("reflectance", "remission")  # other names for the intensity
 
 
@@ -43,12 +43,9 @@ def load_points(file: Path, stamp_ns: int, frame_id: str = "", *,
                 scale: Callable[[], float]) -> PointCloud:
     """Read the usable points of a file of SUFFIXES.
 
-    Args:
-        scale: returns the intensity of a full reflection, see make_cloud_scale_reader.
-
-    Raises:
-        InputError: the file is malformed, or all points are beyond MAX_RANGE, as in map coordinates
-            (UTM).
+    scale: returns the intensity of a full reflection, see make_cloud_scale_reader.
+    Raises InputError if the file is malformed, or if all points are beyond MAX_RANGE, as in map
+    coordinates (UTM).
     """
     try:
         message = to_message(file, stamp_ns, frame_id)
@@ -61,10 +58,7 @@ def load_points(file: Path, stamp_ns: int, frame_id: str = "", *,
 
 
 def check_range(points: np.ndarray, where: object) -> None:
-    """Raise InputError if all finite points of a structured array are beyond MAX_RANGE.
-
-    `where` names the cloud in the message.
-    """
+    """Raise InputError, which names `where`, if all finite points are beyond MAX_RANGE."""
     coordinates = read_xyz(points)
     far = np.abs(coordinates[np.isfinite(coordinates).all(axis=1)]).max(axis=1, initial=0)
     if len(far) and far.min() > MAX_RANGE / 2:
@@ -88,16 +82,10 @@ def to_message(file: Path, stamp_ns: int = 0, frame_id: str = "") -> Any:
 
 
 def read_points(file: Path) -> np.ndarray:
-    """Read a file of SUFFIXES.
+    """Read a file of SUFFIXES as structured array (N,) with all columns.
 
-    Names of columns are converted to lower case, CloudCompare's prefix "scalar_" is removed, and
-    REFLECTANCE becomes "intensity".
-
-    Returns:
-        (N,) structured array with the columns of the file.
-
-    Raises:
-        InputError: the file cannot be read, or has no x, y or z.
+    Names are converted to lower case, CloudCompare's prefix "scalar_" is removed, and REFLECTANCE
+    becomes "intensity". Raises InputError if the file cannot be read, or has no x, y or z.
     """
     points = _rename_columns(READERS[file.suffix.lower()](file))
     if missing := {"x", "y", "z"} - set(points.dtype.names or ()):
@@ -119,11 +107,10 @@ def _rename_columns(points: np.ndarray) -> np.ndarray:
 
 
 def read_npy(file: Path) -> np.ndarray:
-    """Read a .npy file: a structured array, or (N, 3) [x y z], or (N, 4) and more [x y z intensity
-    ...].
+    """Read a .npy file: (N, 3) [x y z], (N, 4) [x y z intensity] or more, or a structured array.
 
     Returns:
-        (N,) structured array with at most four columns, or all fields of a structured one.
+        (N,) structured array with the first four columns, or all fields of a structured one.
 
     Raises:
         InputError: the array has another shape or type.
@@ -144,12 +131,8 @@ def read_npy(file: Path) -> np.ndarray:
 
 
 def _read_bin(file: Path) -> np.ndarray:
-    """Read a .bin file of float32: KITTI's four columns, or nuScenes' five, the last being the
-    ring.
-
-    The format does not state the number of columns; it is inferred from the values. Raises
-    InputError if they are neither.
-    """
+    """Read a .bin file of float32: KITTI's four columns, or nuScenes' five, of which the last is
+    the ring. The number of columns is inferred from the values; InputError if neither fits."""
     if file.stat().st_size % 20 == 0:
         cloud = read_records(file, SWEEP)
         ring = cloud[:SAMPLE_SIZE, 4]
@@ -165,7 +148,7 @@ def _read_bin(file: Path) -> np.ndarray:
 
 
 def _to_structured(cloud: np.ndarray, columns: str) -> np.ndarray:
-    """Return an array (N, C) as (N,) with named columns; surplus names are ignored."""
+    """View an array (N, C) as (N,) with named columns; surplus names are ignored."""
     names = columns.split()[:cloud.shape[1]]
     return np.ascontiguousarray(cloud).view([(name, cloud.dtype) for name in names]).reshape(-1)
 

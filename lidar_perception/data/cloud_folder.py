@@ -23,10 +23,8 @@ NANOSECOND_DIGITS = 9
 
 
 def list_cloud_files(path: Path) -> list[Path]:
-    """Return the point cloud files at a path: the file itself, or those in a folder.
-
-    They are sorted by the times in their names, else by the numbers in their names (2 before 10).
-    """
+    """Return the point cloud file at a path, or those in a folder, by the times or numbers in their
+    names (2 before 10)."""
     files = [file for file in ([path] if path.is_file() else path.glob("*")) if is_cloud(file)]
     if stamps := _parse_stamps(files):
         return [file for _, file in sorted(zip(stamps, files))]
@@ -42,8 +40,8 @@ def is_layout(path: Path) -> bool:
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
     """Open the clouds as one drive without labels.
 
-    Stamps are the Unix times in the names of the files (in seconds, as 1700000000.1, or in ms, us
-    or ns) if all have one; otherwise a rate of 10 Hz is assumed.
+    Stamps are the Unix times in all file names (in seconds, as 1700000000.1, or in ms, us or ns);
+    without them, 10 Hz is assumed.
     """
     files = list_cloud_files(path)
     names = [file.stem for file in files]
@@ -62,14 +60,13 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
 
 
 def parse_times(files: list[Path]) -> list[int]:
-    """Return the times in the names of files in ns; empty if one has none, or if they do not
-    ascend."""
+    """Return the times in the names of files in ns; [] unless all have one and they ascend."""
     stamps = _parse_stamps(files)
     return stamps if all(a < b for a, b in pairwise(stamps)) else []
 
 
 def _parse_stamps(files: list[Path]) -> list[int]:
-    """Return the times in the names of files in ns; empty if one has none."""
+    """Return the times in the names of files in ns; [] unless all have one."""
     parts = [part for file in files if (part := _split_name(file)) is not None]
     if len(parts) < len(files):
         return []
@@ -89,9 +86,9 @@ def _parse_stamps(files: list[Path]) -> list[int]:
 
 
 def _split_name(file: Path) -> tuple[int, str] | None:
-    """Return the time before the point in the name of a file in ns, and the digits after the point.
+    """Return the whole part of the time in a file name in ns, and the digits after the point.
 
-    None if it is not a time. KITTI's raw frames have ten digits, too, but start with 0.
+    None if it is not a time; frames of KITTI's raw drives also have ten digits, but start with 0.
     """
     whole, _, fraction = file.name.removesuffix(file.suffix).partition(".")
     if not whole.isdecimal() or whole[0] == "0" or len(whole) not in UNIT_NS_BY_DIGITS or (

@@ -1,6 +1,6 @@
 """Frames and recordings: the common form of all data sets, bags and simulated drives.
 
-Files are read when their content is used, so a list of all frames needs the file names only.
+Files are read only when their content is used.
 """
 
 from __future__ import annotations
@@ -44,8 +44,7 @@ def fixed_scale() -> float:
 class Frame:
     """One scan of a recording.
 
-    Its functions read files when they are called. They raise InputError that names the file if it
-    is missing or malformed.
+    Its functions read files, and raise InputError if a file is missing or malformed.
 
     Attributes:
         name: unique within the recording.
@@ -58,9 +57,8 @@ class Frame:
         index: number of the frame in its drive.
         sensor_height: metres above the ground.
         points, image: files, or None.
-        files: all files that points, labels and calibration are read from, existing or not; () if
-            labels cannot be attributed to files.
-        native: data that only the evaluation protocol of this data set needs.
+        files: all files with points, labels and calibration, existing or not; () if unknown.
+        native: data for the evaluation protocol of this data set.
         intensity_max: returns the intensity of a full reflection; 0 if the format defines it.
     """
 
@@ -81,27 +79,24 @@ class Frame:
     intensity_max: Callable[[], float] = fixed_scale
 
     def camera(self) -> Camera | None:
-        """Return the camera that sees the frame; None without a calibration."""
+        """Return the camera of the frame; None without a calibration."""
         calibration = self.calibration()
         return None if calibration is None else calibration.camera()
 
     def with_cached_scan(self) -> Frame:
-        """Return the same frame with a scan that is read once and kept in memory."""
+        """Return the frame with a scan that is read once and then cached."""
         return replace(self, load=cache(self.load))
 
     @staticmethod
     def of(name: str, scan: PointCloud, truth: GroundTruth | None = None,
            calibration: Calibration | None = None, **more: Any) -> Frame:
-        """Make a frame of data in memory."""
+        """Make a frame from data in memory."""
         return Frame(name, scan.stamp_ns, partial(_identity, scan), partial(_identity, truth),
                      calibration=partial(_identity, calibration), **more)
 
 
 def read_frame_id(frames: Sequence[Frame]) -> str:
-    """Return the coordinate frame of the clouds, from the first one.
-
-    "" without frames, or if the first one cannot be read; whoever loads it gets the error.
-    """
+    """Return the coordinate frame of the first cloud; "" if it cannot be read or is missing."""
     with suppress(InputError):
         return frames[0].load().frame_id if frames else ""
     return ""
@@ -111,6 +106,7 @@ def _identity(value: Any) -> Any:
     return value
 
 
+MAX_GAP_S = 2.0  # between two frames of a drive
 BOXES, POINT_LABELS, CAMERA, POSES = "labelled boxes", "labelled points", "a camera", "poses"
 
 
@@ -120,12 +116,12 @@ class Recording:
 
     Attributes:
         layout: description of the recognised layout.
-        has: those of BOXES, POINT_LABELS, CAMERA and POSES that some frames have.
+        has: content of at least some frames: BOXES, POINT_LABELS, CAMERA and POSES.
         missing_scans: (name, reason) of labels without a scan.
-        reopen: opens the same recording again, also in another process; takes the arguments of
+        reopen: opens the recording again, also in another process; its arguments are those of
             data.open.open_recording.
-        has_sensor_height: the recording states the height of its sensor; otherwise the
-            sensor_height of its frames is KITTI's.
+        has_sensor_height: the recording states the sensor height; otherwise that of KITTI is
+            assumed.
         is_sequential: frames follow each other in time; otherwise they are unrelated.
         has_times: stamps were recorded; otherwise 10 Hz is assumed.
     """
@@ -147,25 +143,40 @@ class Recording:
         return iter(self.frames)
 
     def __str__(self) -> str:
-        """Return one line that describes the recording."""
+        """Return a one-line description."""
         count = f"{len(self)} frame{'' if len(self) == 1 else 's'}"
         return ", ".join((f"{self.path}: {self.layout}", count, *sorted(self.has)))
 
     def require(self, content: str, verb: str) -> None:
-        """Raise InputError if no frame has the given content, which `verb` needs.
-
-        `what` is one of BOXES, POINT_LABELS, CAMERA and POSES.
-        """
+        """Raise InputError if no frame has a content such as BOXES, which `verb` needs."""
         if content not in self.has:
             raise InputError(f"{self.path} ({self.layout}) has no {content.removeprefix('a ')}, "
                              f"which {verb} needs")
 
     def select(self, names: Sequence[str]) -> Recording:
-        """Return the frames with these names, in this order. Raises InputError for unknown
-        names."""
+        """Return the frames with these names, in this order. InputError for unknown names."""
         numbers = {frame.name: i for i, frame in enumerate(self.frames)}
         if unknown := [name for name in names if name not in numbers]:
             raise InputError(f"{self.path} has no frame {unknown[0]} ({len(unknown)} unknown); its "
                              f"first is {next(iter(numbers), 'none')}")
         return replace(self, frames=[self.frames[numbers[name]] for name in names],
                        missing_scans=())
+
+
+def is_same_drive(previous_ns: int, stamp_ns: int) -> bool:
+    """Return True if the stamp of a frame continues the drive of the previous one."""
+    return 0 <= stamp_ns - previous_ns <= MAX_GAP_S * 1e9
+
+
+def split_drives(frames: Sequence[Frame]) -> dict[str, list[list[int]]]:
+    """Return the frame numbers of each drive, by sequence.
+
+    A new drive starts after a gap of more than MAX_GAP_S, and where stamps go back.
+    """
+    drives: dict[str, list[list[int]]] = {}
+    for number, frame in enumerate(frames):
+        runs = drives.setdefault(frame.sequence, [])
+        if not runs or not is_same_drive(frames[runs[-1][-1]].stamp_ns, frame.stamp_ns):
+            runs.append([])
+        runs[-1].append(number)
+    return drives

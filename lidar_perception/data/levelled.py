@@ -1,5 +1,4 @@
-"""Frames of a sensor in any mounting, converted to the input of the nodes: level, x ahead,
-cropped."""
+"""Conversion of frames of a sensor in any mounting to those of a level one, x ahead, cropped."""
 
 from __future__ import annotations
 
@@ -22,10 +21,10 @@ from lidar_perception.wire.topics import LIDAR_FRAME
 
 @dataclass(frozen=True)
 class SensorMount:
-    """Mounting of a sensor, and how its clouds are read; values are those of the node parameters.
+    """Mounting of a sensor, and parameters for reading its clouds, as of the nodes.
 
     Attributes:
-        height: metres above the ground; None: as stated by the recording.
+        height: metres above the ground; None: as in the recording.
         roll, pitch: of the sensor, radians, as in a URDF's rpy.
         ahead: direction of travel, counter-clockwise from the sensor's x axis, radians.
         crop: the robot's body in sensor coordinates.
@@ -41,22 +40,20 @@ class SensorMount:
 
 
 def level_frame(frame: Frame, mount: SensorMount, poses: PoseLookup | None = None) -> Frame:
-    """Return a frame of a bag or file as a level sensor at the same place would give it, x ahead.
+    """Convert a frame of a bag or file to that of a level sensor at the same place, x ahead.
 
-    Labels, camera and pose are transformed along; boxes stay upright. If the cloud is rotated,
+    Labels, camera and pose are transformed, too; boxes stay upright. If the cloud is rotated,
     "_level" is appended to its frame_id.
 
     Args:
         frame: native() returns its message.
-        poses: returns the poses (M, 4, 4) of the sensor at times (M,) ns. If given, points are
-            moved to the stamp first, as input.deskew does; load() then raises InputError if a pose
-            is unknown, or if the cloud has no time column.
+        poses: returns the poses (M, 4, 4) of the sensor at times (M,) ns, for motion correction as
+            by input.deskew; load() raises InputError if a pose or the time column is missing.
     """
     rotation = find_level_transform(make_tilted_pose(mount.roll, mount.pitch), mount.ahead)
     inverse_rotation = np.eye(4) if rotation is None else invert_pose(rotation)
 
     def read() -> tuple[np.ndarray, PointCloud]:
-        """Return the indices of the points that are kept, and these points."""
         message = frame.native()
         scan, indices = to_point_cloud(message, mount.intensity_max or frame.intensity_max())
         kept, scan = crop_frame(scan, mount.crop, level=rotation)

@@ -1,7 +1,7 @@
 """Reader of MCAP files, with or without chunks, indexes, statistics and repeated channels.
 
-Channels, counts and locations of messages come from the data section. The summary at the end is
-compared with it, so that damage in either is found. Format: https://mcap.dev/spec.
+Channels, counts and locations of messages come from the data section, which is compared with the
+summary to detect damage. Format: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from lidar_perception.wire.compression import MAX_BYTES, decompress
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, CHUNK_INDEX, DATA_END = 7, 8, 15
-HEAD_BYTES = 64  # of a record that are read first
+HEAD_BYTES = 64  # that are read of a record before its content
 RECORD = struct.Struct("<BQ")  # kind of a record, and number of bytes that follow
 FOOTER_BYTES = RECORD.size + 20
 NO_INDEX = (RECORD.pack(DATA_END, 4) + bytes(4) + RECORD.pack(FOOTER, 20) + bytes(20)
@@ -59,11 +59,11 @@ class Chunk:
 class McapFile:
     """An MCAP file open for reading, see StorageFile.
 
-    Opening reads the summary and 64 bytes of each record outside of chunks. It decompresses only
-    chunks that have no message index, or that define channels which the summary does not repeat.
+    Opening reads the summary and HEAD_BYTES of each record outside of chunks. It decompresses only
+    chunks without a message index, and those that define channels which the summary lacks.
 
     Attributes:
-        profile: kind of its messages as given by the writer: ros2, ros1, or "".
+        profile: kind of messages as stated by the writer: ros2, ros1, or "".
 
     Raises:
         ValueError: the file is damaged.
@@ -124,7 +124,7 @@ class McapFile:
         return os.pread(self.file.fileno(), size, at)
 
     def _read_summary(self) -> tuple[int, int, bytes]:
-        """Return the offset of the summary (0 without one), that of the footer, and the summary."""
+        """Return the offsets of the summary (0 without one) and of the footer, and the summary."""
         size = os.fstat(self.file.fileno()).st_size
         end = size - len(MAGIC) - FOOTER_BYTES
         footer = self._read(max(end, 0), FOOTER_BYTES + len(MAGIC))
@@ -142,7 +142,7 @@ class McapFile:
         return summary_at, end, summary
 
     def _scan_data_section(self, end: int) -> np.ndarray:
-        """Read the head of each record in the data section, which ends at `end` or before.
+        """Read the head of each record in the data section, up to `end`.
 
         Returns:
             The messages outside of chunks, (M,) LOCATION with ascending times.
@@ -192,8 +192,8 @@ class McapFile:
             self.channels.setdefault(channel.id, channel)
 
     def _complete_definitions(self) -> None:
-        """Decompress the chunks without message index, and as many of the first chunks as are
-        needed to define all channels that have messages."""
+        """Decompress the chunks without a message index, and first chunks until all channels with
+        messages are defined."""
         before = iter(self.chunks)
         for chunk in self.chunks:
             if not chunk.counts:

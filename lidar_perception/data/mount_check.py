@@ -13,38 +13,32 @@ from lidar_perception.ground.segment import level_points
 from lidar_perception.ground.threshold import fit_plane_by_ransac, height_above_plane
 from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
-# The floor is fitted beyond the vehicle, and near enough for one plane.
+# The floor is fitted beyond the vehicle, and close enough for one plane.
 MIN_RANGE_M, MAX_RANGE_M = 2.5, 12.0
-CELL_M = 0.5                # every cell of the ground counts once, however many points it has
+CELL_M = 0.5                # size of a cell of the grid, of which the lowest point counts
 FLOOR_PLANE = ThresholdParams(max_slope=10.0)
 STEEP_FLOOR_PLANE = ThresholdParams(max_slope=30.0)  # for a sensor that leans
 MIN_CELLS = 10
 MIN_FLOOR_SHARE = 0.25      # minimum share of the cells whose lowest point must be on the plane
 FIRST_CLOUDS = 3            # number of clouds of a recording that are checked
 HEIGHT_TOLERANCE_M = 0.25   # between the parameter and the measured height
-MAX_LEAN_DEG = 5.0          # roads slope as much
+MAX_LEAN_DEG = 5.0          # slope of roads
 
 
 def measure_sensor_height(xyz: np.ndarray,
                           pose: SensorPoseParams = SensorPoseParams()) -> float | None:
-    """Return the height of the sensor above the ground around it, in metres.
+    """Measure the height of the sensor above the ground around it, in metres.
 
-    The ground is the plane through most of the lowest points of the cells of a grid, so that a
-    dense wall or a vehicle nearby does not outweigh it. The height is negative for a plane
-    overhead, as of a sensor mounted upside down.
-
-    Args:
-        xyz: (N, 3) points of the sensor.
-
-    Returns:
-        None if there is no such plane.
+    The ground is the plane through most of the lowest points of the cells of a grid, so that dense
+    walls or vehicles do not outweigh it. The height is negative for a plane overhead, as of a
+    sensor mounted upside down. None without such a plane.
     """
     plane = _find_floor(level_points(xyz, pose))
     return None if plane is None else -float(plane[2])
 
 
 def find_height_problem(measured: float | None, pose: SensorPoseParams) -> str | None:
-    """Describe how a measured height contradicts sensor_pose, with the remedy; None if it fits."""
+    """Describe a wrong height in sensor_pose, with the remedy; None if it fits the measured one."""
     if measured is None or abs(measured - pose.height) <= HEIGHT_TOLERANCE_M:
         return None
     if measured < 0:
@@ -55,10 +49,7 @@ def find_height_problem(measured: float | None, pose: SensorPoseParams) -> str |
 
 
 def load_first_clouds(recording: Recording) -> list[PointCloud]:
-    """Load the clouds that the check of a recording needs.
-
-    The list is empty if one of them cannot be read: the caller that needs it reports the error.
-    """
+    """Load the clouds for the check of a recording; [] if one of them cannot be read."""
     try:
         return [frame.load() for frame in islice(recording, FIRST_CLOUDS)]
     except InputError:
@@ -66,10 +57,10 @@ def load_first_clouds(recording: Recording) -> list[PointCloud]:
 
 
 def apply_measured_height(recording: Recording, clouds: Sequence[PointCloud]) -> Recording:
-    """Reopen a recording with the sensor height that its first clouds show.
+    """Reopen a recording with the sensor height that is measured in its first clouds.
 
-    The recording itself is returned if it states the height, if its clouds disagree, or if the
-    height is about KITTI's.
+    The same recording is returned if it states the height, if its clouds disagree, or if the
+    height is about that of KITTI's sensor.
     """
     if recording.has_sensor_height or recording.reopen is None:
         return recording
@@ -83,7 +74,7 @@ def apply_measured_height(recording: Recording, clouds: Sequence[PointCloud]) ->
 
 
 def find_mount_problem(recording: Recording, clouds: Sequence[PointCloud]) -> str | None:
-    """Describe a sensor that leans or is upside down, by the first clouds, with the remedy.
+    """Describe a tilted or inverted sensor in the first clouds, with the remedy.
 
     None if the sensor is level, or if fewer than two clouds show a floor.
     """
@@ -113,7 +104,7 @@ def _find_floor(xyz: np.ndarray, params: ThresholdParams = FLOOR_PLANE) -> np.nd
 
 
 def _find_lowest_points(xyz: np.ndarray) -> np.ndarray:
-    """Return the lowest point of every cell of CELL_M around the sensor, (K, 3)."""
+    """Return the lowest points (K, 3) of the cells around the sensor."""
     square = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
     near = xyz.compress((square >= MIN_RANGE_M**2) & (square <= MAX_RANGE_M**2), axis=0)
     side = 2 * round(MAX_RANGE_M / CELL_M) + 1

@@ -1,8 +1,10 @@
-"""Opening of any recording, by recognising its layout."""
+"""Opening of recordings: recognition of their layout, and the stored height of their sensor."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -14,9 +16,9 @@ from lidar_perception.data.cloud_files import SUFFIXES
 from lidar_perception.data.frame import Recording
 from lidar_perception.data.kitti import folder as kitti
 from lidar_perception.data.kitti import kitti360, odometry, raw
-from lidar_perception.data.mounting import read_height
 from lidar_perception.data.nuscenes import folder as nuscenes
-from lidar_perception.runs.files import read_text
+from lidar_perception.runs.files import read_text, write_text
+from lidar_perception.runs.resumable_folder import INCOMPLETE_NAME, RECORD_NAME
 from lidar_perception.types import InputError
 
 # Modules with is_layout(path) and open_layout(path, ...), and a description of the folder. The
@@ -52,6 +54,13 @@ CONVERTERS = {
 }
 MAX_FILES = 10_000  # of a folder that are searched for these suffixes
 
+# Sensor height of a folder in one of KITTI's layouts, which do not store it.
+HEIGHT_FILE = "mount.json"  # written by `convert`
+SIMULATION_KEY = "sensor_digest"  # only in a record of `simulate`
+MAX_HEIGHT_FILE_BYTES = 1 << 16
+MAX_DEPTH = 3  # of an opened folder below the file, as of training/velodyne/0000
+MAX_HEIGHT_M = 50.0
+
 
 def open_recording(path: str | Path, *, split: str | Path | None = None, points: str = "",
                    scans: bool = True, sensor_height: float | None = None) -> Recording:
@@ -68,7 +77,7 @@ def open_recording(path: str | Path, *, split: str | Path | None = None, points:
         sensor_height: metres above the ground, instead of that of the recording.
 
     Raises:
-        InputError: the path cannot be opened; the message names what is missing.
+        InputError: the path cannot be opened.
     """
     path, topic = split_topic(path)
     points = points or topic
@@ -102,7 +111,7 @@ def describe_formats() -> str:
 def find_layout(path: Path) -> ModuleType | None:
     """Return the module of LAYOUTS for a path, or None.
 
-    Raises InputError that names a converter for a known but unsupported format.
+    For unsupported formats in CONVERTERS, raise InputError that names a converter.
     """
     if not (path.is_file() and path.suffix.lower() in CONVERTERS):
         for layout in LAYOUTS:
@@ -117,16 +126,13 @@ def find_layout(path: Path) -> ModuleType | None:
 
 
 def split_topic(path: str | Path) -> tuple[Path, str]:
-    """Split a path such as drive.bag:/front/points into the path of the bag and the topic.
-
-    The topic is "" if the path does not name one.
-    """
+    """Split a path such as drive.bag:/front/points into the path of the bag and the topic or ""."""
     name, colon, topic = str(path).rpartition(":/")
     return (Path(name), f"/{topic}") if colon and not Path(path).exists() else (Path(path), "")
 
 
 def _select_split(recording: Recording, split: Path) -> Recording:
-    """Return the frames that a split file names, by their names or their sequence, each once."""
+    """Return the frames that a split file names by frame or sequence, without duplicates."""
     names = read_text(split, what="the split").split()
     sequences: dict[str, list[str]] = {}
     frames: dict[str, None] = {}
@@ -146,3 +152,24 @@ def _select_split(recording: Recording, split: Path) -> Recording:
         raise InputError(f"{split} names {unknown[0]} ({len(unknown)} unknown), which is not in "
                          f"{recording.path}; its first frame is {first}")
     return recording.select(list(chosen))
+
+
+def write_height(folder: Path, height: float) -> None:
+    """Store the sensor height above the ground, in metres, in a folder."""
+    write_text(folder / HEIGHT_FILE, json.dumps({"height": height}))
+
+
+def read_height(path: Path) -> float | None:
+    """Return the sensor height in metres that `convert` or `simulate` stored in a folder or above.
+
+    None if there is none.
+    """
+    for folder in (path, *path.absolute().parents[:MAX_DEPTH]):
+        for name in (HEIGHT_FILE, RECORD_NAME, INCOMPLETE_NAME):
+            with suppress(InputError, ValueError, RecursionError):
+                content = json.loads(read_text(folder / name, MAX_HEIGHT_FILE_BYTES))
+                if isinstance(content, dict) and (name == HEIGHT_FILE or SIMULATION_KEY in content):
+                    height = content.get("height")
+                    if isinstance(height, (int, float)) and 0 < height <= MAX_HEIGHT_M:
+                        return float(height)
+    return None

@@ -32,10 +32,7 @@ SUPPORTED = "give the folder of a rosbag2 bag, an .mcap, a .db3 or a ROS 1 .bag 
 
 
 def list_storage_files(folder: Path) -> list[Path]:
-    """Return the files in a folder with the suffix of a storage file, sorted by name.
-
-    Empty if there is no such folder.
-    """
+    """Return the storage files in a folder by name; [] if there is no such folder."""
     if not folder.is_dir():
         return []
     return sorted(file for file in folder.iterdir()
@@ -43,13 +40,11 @@ def list_storage_files(folder: Path) -> list[Path]:
 
 
 def find_files(path: Path, metadata: Metadata) -> list[Path]:
-    """Return the storage files of the bag at a path.
-
-    These are the files named by metadata.yaml, or without one, files whose names belong together.
-    Differences are added to metadata.problems.
+    """Return the storage files of a bag: those in metadata.yaml, or without it, those whose names
+    belong together. Differences are added to metadata.problems.
 
     Raises:
-        InputError: there is no bag, or it is ambiguous which one is meant.
+        InputError: there is no bag, or there are several.
     """
     if not path.exists():
         raise InputError(f"the bag {path} does not exist")
@@ -80,7 +75,7 @@ def find_files(path: Path, metadata: Metadata) -> list[Path]:
 
 
 def open_file(path: Path, stack: ExitStack) -> StorageFile:
-    """Open a storage file; it is closed with the stack. Raises InputError if it is damaged."""
+    """Open a storage file, to be closed by the stack. InputError if it is damaged."""
     try:
         source = _decompress(path, stack) if _read_head(path).startswith(ZSTD_MAGIC) else path
         head = _read_head(source)
@@ -97,7 +92,7 @@ def open_file(path: Path, stack: ExitStack) -> StorageFile:
         for topic in file.topics:
             if not all(isinstance(text, str) for text in (topic.name, topic.type, topic.encoding)):
                 raise ValueError(f"topic {topic.name!r} has the type {topic.type!r}")
-        # Some writers leave out "msg", or the encoding if it is that of ROS 2.
+        # Some writers omit "msg", or the encoding if it is that of ROS 2.
         file.topics = [topic._replace(type=re.sub(r"^(\w+)/(\w+)$", r"\1/msg/\2", topic.type),
                                       encoding=topic.encoding or "cdr") for topic in file.topics]
         if file.times and not all(isinstance(time, int) for time in file.times):

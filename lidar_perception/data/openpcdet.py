@@ -56,8 +56,8 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
 def read_labels(path: Path) -> GroundTruth | None:
     """Read the objects of a label file; None if it does not exist.
 
-    An unknown class becomes Misc, with its name as class_name; synonyms (Vehicle, person) are
-    known.
+    Aliases of classes, such as Vehicle, are recognised. Unknown classes become Misc, with their
+    name as class_name.
     """
     if not path.exists():
         return None

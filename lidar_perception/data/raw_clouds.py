@@ -1,4 +1,4 @@
-"""Clouds with all the columns that their driver wrote, from any recording."""
+"""Clouds of any recording with all columns that their driver wrote."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lidar_perception.wire.topics import LIDAR_FRAME
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
 
-PAIR_DISTANCE = 8  # between the clouds of every second pair, see choose_clouds
+PAIR_DISTANCE = 8  # clouds, see choose_clouds
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,8 @@ class RawClouds:
     Attributes:
         layout: description of the recognised layout.
         stamps_ns: stamps of all clouds; None if they were not recorded.
-        load: load(i) returns cloud i as PointCloud2 of rosbags' class; raises InputError if it is
-            damaged.
-        poses, topic: poses and topic of the clouds of a bag.
+        load: load(i) returns cloud i as PointCloud2 of rosbags' class; InputError if damaged.
+        poses, topic: those of the clouds of a bag.
     """
 
     path: Path
@@ -54,7 +53,7 @@ def open_clouds(path: str | Path, topic: str | None = None) -> RawClouds:
         topic: topic of the clouds of a bag that has several.
 
     Raises:
-        InputError: the path cannot be opened; the message names what is missing.
+        InputError: the path cannot be opened.
     """
     path, path_topic = split_topic(path)
     if not path.exists():
@@ -95,13 +94,10 @@ def _to_message(frame: Frame) -> Any:
 
 
 def choose_clouds(count: int, wanted: int) -> list[int]:
-    """Choose up to `wanted` of `count` clouds, in pairs that are spread evenly.
+    """Choose up to `wanted` of `count` clouds, in pairs that are spread evenly; return the numbers.
 
-    Motion shows within a pair, and places differ between pairs. A fast robot moves between
-    neighbours; for a slow one, the clouds of every second pair are PAIR_DISTANCE apart.
-
-    Returns:
-        Ascending numbers of the chosen clouds.
+    A pair shows motion, and pairs are at different places. The clouds of a pair are neighbours, for
+    fast robots, or PAIR_DISTANCE apart, for slow ones.
     """
     if count <= wanted or wanted < 2:
         return list(range(min(count, wanted)))

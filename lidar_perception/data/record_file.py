@@ -1,4 +1,4 @@
-"""File that grows by whole records, even if the disk becomes full."""
+"""File that contains only complete records, even if the disk becomes full."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 
 
 class RecordFile:
-    """A stream for one writer; a context manager.
+    """Output stream; a context manager.
 
-    Each write() is a record. If one does not fit, no part of it remains in the file; it and all
-    later ones raise OSError.
+    Each write() is a record. If a record does not fit on the disk, no part of it remains in the
+    file; this and all later calls raise OSError.
     """
 
     def __init__(self, path: Path):
@@ -53,7 +53,7 @@ class RecordFile:
         os.fsync(self.file.fileno())
 
     def close_with(self, end: bytes) -> None:
-        """Write a final record `end` after the last record that leaves enough space for it.
+        """Write a final record, after removing as many of the last records as it needs space.
 
         An existing final record of the same kind is replaced.
         """

@@ -1,4 +1,4 @@
-"""Intensity scale of a recording: the same for all its frames, in whatever order they are read."""
+"""Intensity scale of a recording, the same for all its frames."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ Column = tuple[np.ndarray, np.dtype] | None  # see wire.messages.read_raw_intens
 
 def make_scale_reader(items: Sequence[Item], read: Callable[[Item], Column]
                       ) -> Callable[[], float]:
-    """Return a function that infers the full_scale() of a recording when it is first called.
-
-    It reads SAMPLE_SIZE clouds, spread evenly. Clouds that raise InputError are ignored.
+    """Return a cached function that infers the intensity scale of a recording from SAMPLE_SIZE
+    clouds, spread evenly.
 
     Args:
         items: files, or other arguments of `read`.
-        read: read(item) returns the intensities as recorded and their dtype, or None.
+        read: read(item) returns the recorded intensities and their dtype, or None. InputError is
+            ignored.
     """
     count = min(SAMPLE_SIZE, len(items))
     chosen = np.linspace(0, max(len(items) - 1, 0), count).astype(int).tolist()
@@ -35,10 +35,9 @@ def make_scale_reader(items: Sequence[Item], read: Callable[[Item], Column]
 
 
 def infer_scale(items: Iterable[Item], read: Callable[[Item], Column]) -> float:
-    """Return the scale of the first SAMPLE_SIZE clouds; 1 without any. Arguments as in
-    make_scale_reader.
+    """Infer the scale from the first SAMPLE_SIZE clouds; 1 without any. See make_scale_reader.
 
-    Clouds that are empty or all 0, as drivers publish at their start, are not counted.
+    Empty clouds and clouds of zeros, which drivers publish at their start, do not count.
     """
     scale, count = StreamScale(), 0
     for item in items:

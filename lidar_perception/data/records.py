@@ -15,8 +15,7 @@ def read_records(path: Path, columns: str, dtype: DTypeLike = np.float32) -> np.
     """Read a file of N records with one number per column.
 
     Args:
-        columns: names of the C columns, such as "x y z reflectance"; for their number, and for
-            error messages.
+        columns: names of the C columns, such as "x y z reflectance".
 
     Returns:
         (N, C) array of the given dtype.

@@ -9,7 +9,7 @@ from typing import Any
 
 from rosbags.highlevel import AnyReader
 
-from lidar_perception.data.qos import LATCHED_QOS
+from lidar_perception.data.bag_metadata import LATCHED_QOS
 from lidar_perception.data.storage import Stream, Topic
 from lidar_perception.wire.clouds import LIVOX
 from lidar_perception.wire.codec import load_typestore
@@ -22,8 +22,8 @@ SUFFIX = ".bag"
 class Ros1File:
     """A .bag file open for reading, see StorageFile.
 
-    Topics of types that Jazzy lacks have the encoding "ros1", as they cannot be read. Fields that a
-    type gained since ROS 1 are empty.
+    Topics of types that Jazzy lacks cannot be read; their encoding is "ros1". Fields that are new
+    since ROS 1 are empty.
     """
 
     def __init__(self, path: Path):

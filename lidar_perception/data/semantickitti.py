@@ -24,11 +24,11 @@ from lidar_perception.data.records import read_records
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import InputError, usable_returns
 
-UNLABELLED = (0, 1)  # unlabelled, outlier (such as a reflection)
+UNLABELLED = (0, 1)  # unlabelled, and outlier, such as a reflection
 # road, parking, sidewalk, other-ground, lane-marking, terrain
 GROUND = (40, 44, 48, 49, 60, 72)
 VEGETATION = 70      # from grass to tree tops: partly ground
-# Classes with instances. The moving ones (252 to 259) have numbers of their own.
+# Classes with instances. MOVING maps the numbers of moving objects to these classes.
 THINGS = {10: "car", 11: "bicycle", 13: "bus", 15: "motorcycle", 16: "on-rails", 18: "truck",
           20: "other-vehicle", 30: "person", 31: "bicyclist", 32: "motorcyclist"}
 MOVING = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20}
@@ -57,7 +57,7 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
 
 
 def _add_point_truth(frame: Frame) -> Frame:
-    """Return the frame with its point labels, and without its camera, as all points are scored."""
+    """Add the point labels to a frame, and remove its camera, as all points are scored."""
     scan = frame.points
     assert scan is not None
     label = scan.parents[1] / f"labels/{scan.stem}.label"

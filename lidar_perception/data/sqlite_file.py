@@ -1,7 +1,4 @@
-"""Reader of rosbag2's SQLite files (.db3) of all ROS 2 distributions.
-
-Files of a recorder that was killed can be read, too.
-"""
+"""Reader of rosbag2's SQLite files (.db3) of all ROS 2 distributions, also of killed recorders."""
 
 from __future__ import annotations
 

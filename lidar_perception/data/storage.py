@@ -1,8 +1,7 @@
 """Interface of the storage files of bags: MCAP, SQLite and ROS 1.
 
-rosbags' reader of ROS 2 bags is not used: it trusts metadata.yaml, finds messages by the text of
-their QoS (rosbags/rosbag2/reader.py), and rejects unusual MCAP files
-(rosbags/rosbag2/storage_mcap.py).
+The reader of rosbags is not used: it trusts metadata.yaml, finds messages by the text of their QoS
+(rosbags/rosbag2/reader.py), and rejects unusual MCAP files (rosbags/rosbag2/storage_mcap.py).
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ Stream = Iterator[Message]  # in order of time
 
 
 class Topic(NamedTuple):
-    """A topic of one file; a file may have several of the same name.
+    """A topic of one file, which may have several topics of the same name.
 
     Attributes:
         id: topic id of its messages.
@@ -55,11 +54,9 @@ class StorageFile(Protocol):
 def merge_streams(sources: Iterable[tuple[int, Callable[[], Stream]]]) -> Stream:
     """Merge streams in order of time.
 
-    A stream is opened when its start time is reached, and closed at its end, so few are open at a
-    time.
+    Streams are opened at their start time, so that few are open at the same time.
 
-    Args:
-        sources: start time of each stream, and the function that opens it.
+    sources: start time of each stream, and the function that opens it.
     """
     open_streams: list[tuple[int, int, Message, Stream]] = []
     for number, (start, begin) in enumerate([*sorted(sources, key=lambda source: source[0]),

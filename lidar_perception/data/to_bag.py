@@ -55,11 +55,11 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
     labels as columns of their cloud.
 
     Args:
-        images: write the camera's PNG files, too.
-        skipped: list that receives the errors of frames that cannot be read; without it, the first
-            one is raised.
+        images: write the PNG files of the camera.
+        skipped: list to which the errors of unreadable frames are added; without it, the first
+            error is raised.
         clouds: False to write everything except clouds.
-        detections_3d: write the labelled boxes as Detection3DArray, too.
+        detections_3d: write the labelled boxes also as Detection3DArray.
 
     Raises:
         InputError: the bag cannot be written, or a frame cannot be read.
@@ -98,8 +98,8 @@ class FrameWriter:
     def __init__(self, bag: BagWriter, *, images: bool = False, clouds: bool = True,
                  detections_3d: bool = False) -> None:
         self.bag, self.images, self.clouds, self.detections_3d = bag, images, clouds, detections_3d
-        self._shown: frozenset[tuple[str, int]] = frozenset()
-        self._labelled: set[int] = set()  # stamps, by which labels are assigned to clouds
+        self._marker_keys: frozenset[tuple[str, int]] = frozenset()  # of the last labels
+        self._labelled_stamps: set[int] = set()
         self._calibration: Calibration | None = None  # the last one written
         bag.add_topic(CAMERA_INFO, "sensor_msgs/msg/CameraInfo", LATCHED_QOS)
         bag.add_topic(EXTRINSICS, "geometry_msgs/msg/TransformStamped", LATCHED_QOS)
@@ -111,14 +111,13 @@ class FrameWriter:
             bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
 
     def read(self, frame: Frame) -> FrameContent:
-        """Read the content of a frame. Raises InputError if it cannot be read or stored in a
-        bag."""
+        """Read the content of a frame. InputError if it cannot be read or stored in a bag."""
         scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
         pose, columns = frame.pose(), frame.point_truth() if self.clouds else None
         if frame.stamp_ns < 0:
             raise InputError(f"{frame.name}: its stamp is before 1970, which a bag cannot store; "
                              "set the clock of the sensor")
-        if truth is not None and frame.stamp_ns in self._labelled:
+        if truth is not None and frame.stamp_ns in self._labelled_stamps:
             raise InputError(f"{frame.name}: another labelled scan has the same stamp, so labels "
                              "could not be assigned to scans")
         header = make_header(frame.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
@@ -127,7 +126,7 @@ class FrameWriter:
                             to_point_array(scan, columns) if self.clouds else None)
 
     def write(self, content: FrameContent) -> None:
-        """Write the content of a frame. Raises InputError if the bag cannot be written."""
+        """Write the content of a frame. InputError if the bag cannot be written."""
         bag, (header, stamp_ns, calibration, pose, truth, image, points) = self.bag, content
         if calibration is not None and not calibration.equals(self._calibration):
             self._calibration = calibration
@@ -135,9 +134,9 @@ class FrameWriter:
         if pose is not None:
             _write_pose(bag, pose, stamp_ns, header.frame_id)
         if truth is not None:
-            self._labelled.add(stamp_ns)
-            markers = make_truth_markers(truth, header, bag_message, self._shown)
-            self._shown = list_marker_keys(markers)
+            self._labelled_stamps.add(stamp_ns)
+            markers = make_truth_markers(truth, header, bag_message, self._marker_keys)
+            self._marker_keys = list_marker_keys(markers)
             bag.write(TRUTH, stamp_ns, markers)
             if self.detections_3d:
                 bag.write(TRUTH_3D, stamp_ns, _make_detections(markers, header))
@@ -148,8 +147,7 @@ class FrameWriter:
 
 
 def to_point_array(scan: PointCloud, labels: PointTruth | None = None) -> np.ndarray:
-    """Return points as structured array (N,): POINT (without intensity if the scan has none), plus
-    POINT_LABELS if labels are given."""
+    """Return a structured array (N,) with the fields of POINT and, with labels, of POINT_LABELS."""
     fields = POINT.descr[:4 if scan.intensity is not None else 3]
     points = np.empty(len(scan), fields + (POINT_LABELS.descr if labels else []))
     for i, axis in enumerate("xyz"):

@@ -1,7 +1,4 @@
-"""Writing of a recording as a data set that open_layout and other tools can read.
-
-Content that a layout cannot store is left out and reported.
-"""
+"""Conversion of recordings to data sets. Content that a layout cannot store is reported."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from lidar_perception.data import semantickitti
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.folder import GAP_NS, PERIOD_NS
 from lidar_perception.data.kitti.write import format_calibration, write_object_text, write_velodyne
-from lidar_perception.data.mounting import write_height
+from lidar_perception.data.open import write_height
 from lidar_perception.labels.datasets_nuscenes import NuscenesTables
 from lidar_perception.labels.drive_labels import (
     NO_TRACK,
@@ -58,7 +55,7 @@ class Summary:
     """Counts of a data set that was written.
 
     Attributes:
-        remarks: omissions and assumptions, with their numbers of frames.
+        remarks: omissions and assumptions, with the number of frames of each.
     """
 
     frames: int = 0
@@ -73,14 +70,14 @@ class Summary:
 
 def write_dataset(layout: str, frames: Iterable[Frame], out: Path,
                   labels: DriveLabels | None = None, force: bool = False) -> Summary:
-    """Write the frames of a recording, in their order, as a data set in one of LAYOUTS.
+    """Write the frames of a recording as a data set in one of LAYOUTS.
 
-    Frames are renumbered from 0; in KITTI's tracking layout, numbers follow their time at 10 Hz. A
-    new drive starts where the recording has one, after a gap of 5 s, and where the calibration
-    changes. A sensor height other than KITTI's is stored as in data/mounting.py.
+    Frames are numbered from 0, in KITTI's tracking layout by their time at 10 Hz. A new drive
+    starts where the recording has one, after a gap of 5 s, and where the calibration changes. A
+    sensor height other than KITTI's is stored, see data.open.write_height.
 
     Args:
-        labels: labels of the frames, instead of those of the recording.
+        labels: labels to write instead of those of the recording.
 
     Raises:
         InputError: something cannot be read or written; `out` is then unchanged.
@@ -120,7 +117,7 @@ def _continues_drive(previous: Frame, frame: Frame) -> bool:
 
 
 def _ensure_camera(frame: Frame, summary: Summary) -> tuple[Frame, Calibration]:
-    """Return the frame, with ASSUMED_CAMERA if it has no camera, and its calibration."""
+    """Return the frame and its calibration, which is ASSUMED_CAMERA if it has none."""
     calibration = frame.calibration()
     if calibration is None:
         summary.remark("assumed: a camera at the LiDAR facing ahead, which KITTI's labels need")
@@ -129,7 +126,6 @@ def _ensure_camera(frame: Frame, summary: Summary) -> tuple[Frame, Calibration]:
 
 
 def _load_cloud(frame: Frame, summary: Summary) -> np.ndarray:
-    """Load a cloud, (N, 4) float32 [x y z intensity]."""
     scan = frame.load()
     if scan.intensity is None:
         summary.remark("assumed: an intensity of 0, as the clouds have none")
@@ -137,7 +133,7 @@ def _load_cloud(frame: Frame, summary: Summary) -> np.ndarray:
 
 
 def _remark_losses(summary: Summary, placed: DatasetFrame, kept: str) -> None:
-    """Add remarks about content that the layout cannot store; `kept` lists what it can."""
+    """Add remarks about content of the frame that is not in `kept`, which the layout can store."""
     labels = placed.labels
     for content, exists in (("poses", placed.frame.pose() is not None),
                             ("point labels", placed.frame.point_truth() is not None),

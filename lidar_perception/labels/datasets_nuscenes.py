@@ -1,8 +1,8 @@
-"""Writer of nuScenes' tables and sweeps; data/nuscenes/folder.py and nuscenes-devkit read them.
+"""Writer of nuScenes' tables and sweeps, which nuscenes-devkit can read.
 
 Caesar et al., CVPR 2020, and nuscenes-devkit's docs/schema_nuscenes.md define the tables. A scene
 is a drive, and each scan is a key frame. The only sensor is LIDAR_TOP, with x to the right and y
-ahead as in nuScenes; there are no cameras, maps or radars.
+ahead; there are no cameras, maps or radars.
 """
 
 from __future__ import annotations
@@ -70,8 +70,7 @@ class NuscenesTables:
         self.last: dict[str, dict[str, Any]] = {}  # last row of each chain, see _add_linked
 
     def add(self, frame: Frame, labels: FrameLabels, drive: int, cloud: np.ndarray) -> None:
-        """Add a scan (N, 4) [x y z intensity] with its labels. Raises InputError if it cannot be
-        written."""
+        """Add a scan (N, 4) [x y z intensity] with its labels. InputError if that fails."""
         scene = f"scene-{drive + 1:04}"
         sample = make_token(scene, len(self.rows["sample"]))
         file = f"samples/{CHANNEL}/{scene}__{CHANNEL}__{frame.stamp_ns // 1000}.pcd.bin"
@@ -115,7 +114,7 @@ class NuscenesTables:
         for k, placement in enumerate(placements):
             track, name, extra = labels.track_ids[k], labels.class_names[k], labels.extra[k]
             lidar, radar = int(inside[k]), 0
-            if rotation := find_read_rotation(labels, k, pose):  # unchanged, so its points are too
+            if rotation := find_read_rotation(labels, k, pose):  # the box is unchanged
                 placement["rotation"] = rotation
                 lidar = extra.get("lidar_points", lidar)
                 radar = extra.get("points", lidar) - lidar
@@ -169,7 +168,7 @@ def _to_quaternion(rotation: np.ndarray) -> list[float]:
 
 
 def _make_png() -> bytes:
-    """Return a PNG file of one black pixel."""
+    """Return a PNG image of one black pixel."""
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc32(kind + data))
 

@@ -46,7 +46,7 @@ class FrameLabels:
            track_ids: ArrayLike | None = None, scores: ArrayLike | None = None,
            extra: Iterable[dict[str, Any]] | None = None,
            notes: Iterable[tuple[str, dict[str, Any]]] = (), where: object = None) -> FrameLabels:
-        """Make labels with the right dtypes and shapes.
+        """Make labels, with conversion of dtypes and shapes.
 
         Raises InputError that names `where` if a box is not finite, is beyond MAX_RANGE or has a
         side that is not positive, if a track id is not an integer, or if columns differ in length.
@@ -88,7 +88,7 @@ class DriveLabels:
 
     Attributes:
         frames: FrameLabels of each frame, in the order of the frames.
-        extra: JSON object with what a format states for the whole drive, by the name of the format.
+        extra: content of a format for the whole drive, as JSON object, by format.
     """
 
     frames: list[FrameLabels]
@@ -113,8 +113,7 @@ Row = tuple[Sequence[float], str, int, float, dict[str, Any]]  # box, class, tra
 def make_frame_labels(frame: Frame, rows: Iterable[Row],
                       notes: Iterable[tuple[str, dict[str, Any]]] = (),
                       where: object = None) -> FrameLabels:
-    """Make the labels of a frame from one row per box; notes and errors are as in
-    FrameLabels.of."""
+    """Make the labels of a frame from one row per box; see FrameLabels.of."""
     columns: list[Any] = [*zip(*rows)] or [[]] * 5
     boxes, names, ids, scores, extra = columns
     return FrameLabels.of(frame.name, frame.stamp_ns, boxes, names, ids, scores, extra, notes,
@@ -122,10 +121,7 @@ def make_frame_labels(frame: Frame, rows: Iterable[Row],
 
 
 def read_frame_labels(frame: Frame) -> FrameLabels:
-    """Read the labels that a recording has for a frame; K = 0 without labels.
-
-    Unknown classes keep the name that the recording gives them.
-    """
+    """Read the labels, with their original class names, that a recording has for a frame."""
     truth = frame.truth()
     if truth is None:
         return FrameLabels.of(frame.name, frame.stamp_ns)
@@ -157,7 +153,7 @@ def to_ground_truth(labels: FrameLabels) -> GroundTruth:
 
 
 def get_id_and_score(labels: FrameLabels, k: int) -> dict[str, Any]:
-    """Return track_id and score of box k, without those that it lacks."""
+    """Return track_id and score of box k, as far as it has them."""
     fields: dict[str, Any] = {}
     if labels.track_ids[k] != NO_TRACK:
         fields["track_id"] = int(labels.track_ids[k])
@@ -167,8 +163,7 @@ def get_id_and_score(labels: FrameLabels, k: int) -> dict[str, Any]:
 
 
 def is_unchanged(box: Sequence[float] | np.ndarray, kept: Sequence[float] | np.ndarray) -> bool:
-    """Return True if a box (7,) is the one that was read, so that the fields read with it are
-    valid."""
+    """Return True if a box (7,) is the one that was read, so that its other fields are valid."""
     difference = np.subtract(box, kept)
     difference[6] = wrap_angle(difference[6])
     return bool(np.abs(difference).max() < MAX_DIFFERENCE)

@@ -59,12 +59,7 @@ WITH_NOTES = {"kitti", "kitti-tracking", "openlabel", "mcap", "mcap-labels"}
 
 @dataclass(frozen=True)
 class ExportResult:
-    """Result of an export.
-
-    Attributes:
-        boxes, frames: number of exported boxes and frames.
-        left_out: what the format cannot store, as text.
-    """
+    """Number of exported boxes and frames, and content that the format cannot store, as text."""
 
     path: Path
     boxes: int
@@ -73,20 +68,20 @@ class ExportResult:
 
 
 def import_labels(path: Path, format: str, frames: Sequence[Frame]) -> DriveLabels:
-    """Read the labels at a path for each frame of a drive, in order.
+    """Read the labels at a path for each frame of a drive.
 
     Raises InputError if they cannot be read, or belong to frames that the drive does not have.
     """
     with np.errstate(all="ignore"):  # FrameLabels.of rejects numbers that overflow
         read = READERS[resolve_format(format, READERS)]
-        return read(path, frames[:])  # the slice of a bag has frames that do not hold their clouds
+        return read(path, frames[:])  # frames of a slice of a bag do not hold their clouds
 
 
 def export_labels(labels: DriveLabels, format: str, out: Path, frames: Sequence[Frame],
                   force: bool = False) -> ExportResult:
-    """Write the labels of the frames of a drive; existing files are replaced only with `force`.
+    """Write the labels of the frames of a drive; replace existing files only with `force`.
 
-    Raises InputError if they cannot be written; nothing is then partly written.
+    Raises InputError, without partial output, if they cannot be written.
     """
     format = resolve_format(format, FORMATS)
     if len(labels) != len(frames):
@@ -124,7 +119,7 @@ def recognise_format(path: Path) -> str:
 
 
 def _recognise_text(file: Path) -> str:
-    """Recognise the format by how many numbers precede the class in the first line."""
+    """Recognise the format by the number of columns before the class in the first line."""
     words = read_text(file, MAX_BYTES).lstrip().partition("\n")[0].split()
     if words and words[0].endswith(":"):
         return ""  # a calibration
@@ -139,12 +134,8 @@ def _recognise_text(file: Path) -> str:
 
 
 def _recognise_json(content: Any) -> str:
-    """Recognise the format by the keys.
-
-    "" for a file without boxes, such as of labelCloud and SUSTechPOINTS, and for other JSON files,
-    whose values may be of any type.
-    """
-    with suppress(TypeError, LookupError, AttributeError):
+    """Recognise the format by the keys; "" for files without boxes, and for other JSON files."""
+    with suppress(TypeError, LookupError, AttributeError):  # values may be of any type
         if isinstance(content, list) or "objs" in content:
             boxes = content if isinstance(content, list) else content["objs"]
             return "sustech" if "psr" in boxes[0] else ""

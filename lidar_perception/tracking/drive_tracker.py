@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from itertools import islice
 
-from lidar_perception.data.drives import is_same_drive
-from lidar_perception.data.frame import POSES, Frame, Recording
+from lidar_perception.data.frame import POSES, Frame, Recording, is_same_drive
 from lidar_perception.tracking.ego import (
     NO_SOURCE,
     choose_recorded_source,
@@ -26,7 +25,7 @@ class DriveTracker:
 
     Call it for each frame in order of time. All tracks end where a new drive begins: at a new
     sequence, or, in a recording without sequences such as a bag, where the stamps jump (see
-    data.drives). Ids are unique in the whole recording.
+    data.frame). Ids are unique in the whole recording.
 
     Args:
         ego: source of the poses, one of RECORDED_EGO; see choose_ego_source. kiss_icp loads every

@@ -9,8 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from lidar_perception.data.drives import split_drives
-from lidar_perception.data.frame import BOXES, Frame, Recording
+from lidar_perception.data.frame import BOXES, Frame, Recording, split_drives
 from lidar_perception.data.mount_check import apply_measured_height, load_first_clouds
 from lidar_perception.data.open import open_recording
 from lidar_perception.training.scenes import RecordedScenes

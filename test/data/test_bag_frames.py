@@ -13,8 +13,7 @@ from samples import STAMP, header, object_folder, scene, walker_truth, write
 
 from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import Bag, BagWriter
-from lidar_perception.data.drives import split_drives
-from lidar_perception.data.frame import CAMERA, Frame
+from lidar_perception.data.frame import CAMERA, Frame, split_drives
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import to_point_array, write_bag
 from lidar_perception.types import InputError

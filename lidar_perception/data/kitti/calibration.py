@@ -65,8 +65,7 @@ def read_raw_calibration(day: Path) -> Calibration:
 
 
 def read_matrices(path: Path) -> dict[str, np.ndarray]:
-    """Read the numbers of each line "NAME: ..." of a file. Raises InputError if it cannot be
-    read."""
+    """Read the numbers in lines "NAME: ..." of a file. InputError if it cannot be read."""
     values = {}
     for line in read_text(path, what="the calibration").splitlines():
         # Some names in the tracking benchmark have no colon.
@@ -80,10 +79,7 @@ def read_matrices(path: Path) -> dict[str, np.ndarray]:
 
 def get_matrix(values: dict, path: Path, name: str, shape: tuple[int, ...],
                other: str = "") -> np.ndarray:
-    """Return the matrix called `name`, or else `other`, in the given shape.
-
-    Raises InputError that names the file if it is missing.
-    """
+    """Return the matrix called `name`, else `other`. InputError if it is missing."""
     found = values.get(name, values.get(other))
     if found is None or found.size != np.prod(shape) or not np.isfinite(found).all():
         raise InputError(f"{path} has no {name} of {int(np.prod(shape))} finite numbers; download "

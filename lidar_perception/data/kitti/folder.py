@@ -45,8 +45,7 @@ def make_velodyne_scale_reader(scans: Sequence[Path]) -> Callable[[], float]:
 
 
 def is_layout(path: Path) -> bool:
-    """Return True for a folder in the object or tracking layout, also with labels but without
-    scans."""
+    """Return True for a folder in the object or tracking layout, even without scans."""
     return any((folder / name).is_dir() for folder in (path / "training", path)
                for name in (*SCANS, "label_2"))
 
@@ -87,7 +86,6 @@ def _find_missing_object_scans(folder: Path) -> list[tuple[str, str]]:
 
 
 def _find_missing_tracking_scans(folder: Path, frames: list[Frame]) -> list[tuple[str, str]]:
-    """Return (name, label) of frames that have labels but no scan."""
     known = {(frame.sequence, frame.index) for frame in frames}
     missing = []
     for label in sorted(folder.glob("label_02/*.txt")):
@@ -151,8 +149,7 @@ def _read_tracking_truth(calibration: Callable[[], Calibration], label: Path
 
 def make_truth_reader(path: Path, read: Callable[[Path], dict[int, GroundTruth]]
                        ) -> Callable[[int], GroundTruth | None]:
-    """Return a function that returns the labels of a frame by its number; None without a label
-    file.
+    """Return a function that returns the labels of a frame by its number, or None without a file.
 
     The label file of the drive is read once.
     """
@@ -164,8 +161,7 @@ def make_truth_reader(path: Path, read: Callable[[Path], dict[int, GroundTruth]]
 
 
 def parse_scan_number(scan: Path) -> int:
-    """Return the number of a scan in its drive, from its file name. Raises InputError if it is
-    none."""
+    """Return the number in the file name of a scan. InputError if it is not a number."""
     try:
         return int(scan.stem)
     except ValueError:

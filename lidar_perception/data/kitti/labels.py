@@ -69,8 +69,8 @@ def parse_label(line: str, path: Path | str = "label", number: int = 0,
                 known_only: bool = False) -> dict:
     """Parse a label line to a dict of class, COLUMNS, and score if the line has one.
 
-    The class is the name in CLASSES, compared without case as KITTI's own program does, or else the
-    text of the line. Raises InputError for an unknown class if known_only, and for other lines.
+    The class is the name in CLASSES, ignoring case as KITTI's own program does, else the text of
+    the line. Raises InputError for other lines, and if known_only, for unknown classes.
     """
     words = line.split()
     first = next((i for i, word in enumerate(words[1:], 1) if _is_number(word)), 1)
@@ -186,11 +186,11 @@ def format_label(label: dict, decimals: int = 2, whole: bool = True) -> str:
 
 
 def read_tracklets(path: Path) -> dict[int, GroundTruth]:
-    """Read tracklet_labels.xml of a raw drive, from KITTI or as exported by CVAT and Datumaro.
+    """Read tracklet_labels.xml of a raw drive, of KITTI or exported by CVAT or Datumaro.
 
     Returns:
         The objects in the LiDAR frame by frame number. Unknown classes become Misc, with their name
-        as class_name. An object without positive size becomes a note.
+        as class_name. Objects without a positive size become notes.
 
     Raises:
         InputError: the file is not such an XML file.
@@ -228,8 +228,7 @@ def _to_tracklet_truth(rows: list, notes: list) -> GroundTruth:
 def _parse_state(pose: ElementTree.Element, name: str) -> float | None:
     """Return the number of a pose's state, 0 if it has none.
 
-    None if Datumaro filled a gap between two boxes of a track: it writes the name of the state
-    then.
+    None for boxes with which Datumaro fills the gaps of a track; their states are names.
     https://github.com/openvinotoolkit/datumaro/blob/develop/src/datumaro/plugins/data_formats/kitti_raw/exporter.py
     """
     text = (pose.findtext(name) or "0").strip()

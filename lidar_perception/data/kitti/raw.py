@@ -77,8 +77,8 @@ def make_frames(drives: Sequence[Path], need_stamps: dict[Path, bool] | None = N
         need_stamps: drives that must have time stamps, as {drive: True}.
 
     Returns:
-        The frames, whose `native` is the folder of the drive, and True if the times of all of them
-        are recorded; otherwise 10 Hz is assumed.
+        The frames, with the folder of the drive as `native`, and False if 10 Hz is assumed for one
+        of the drives, which has no times.
 
     Raises:
         InputError: required time stamps are missing.
@@ -103,8 +103,7 @@ def make_frames(drives: Sequence[Path], need_stamps: dict[Path, bool] | None = N
 
 
 def list_scans(drive: Path) -> list[Path]:
-    """Return the scans of a drive, sorted by name; one of each name if there are several
-    suffixes."""
+    """Return the scans of a drive by name, one of each name if there are several suffixes."""
     files = {file.stem: file for suffix in SUFFIXES for file in (drive / DATA).glob("*")
              if file.suffix.lower() == suffix and is_cloud(file)}
     return [file for _, file in sorted(files.items())]
@@ -118,7 +117,6 @@ def load_scan(file: Path, stamp_ns: int, scale: Callable[[], float]) -> PointClo
 
 
 def _read_numbers(drive: Path, files: Sequence[Path]) -> list[int]:
-    """Return the numbers of scans: their file names, or as given by frame_list.txt."""
     path = drive / FRAME_LIST
     if not path.exists():
         return [parse_scan_number(file) for file in files]
@@ -129,13 +127,9 @@ def _read_numbers(drive: Path, files: Sequence[Path]) -> list[int]:
 
 
 def read_frame_list(path: Path) -> dict[str, int]:
-    """Read lines "NUMBER NAME".
+    """Read lines "NUMBER NAME"; return the numbers of scans by name without folder and suffix.
 
-    Returns:
-        The number of each scan by its name without folder and suffix.
-
-    Raises:
-        InputError: a line has another format.
+    Raises InputError if a line has another format.
     """
     rows = [line.split(maxsplit=1) for line in read_text(path, what="the list").splitlines()
             if line.strip() and not line.startswith("#")]
@@ -147,13 +141,13 @@ def read_frame_list(path: Path) -> dict[str, int]:
 
 
 def _read_stamps(drive: Path, numbers: Sequence[int], required: bool) -> list[int]:
-    """Read timestamps.txt of a drive.
+    """Read timestamps.txt of a drive, with lines such as 2011-09-26 13:02:25.594360375 (UTC).
 
-    Lines are "2011-09-26 13:02:25.594360375", in UTC. Line i belongs to scan number i, and is blank
-    if the scan is missing; in files without blank lines, the i-th line belongs to the i-th scan.
+    Line i belongs to scan number i, and is blank if the scan is missing; in files without blank
+    lines, the i-th line belongs to the i-th scan.
 
     Returns:
-        Stamps in ns of the scans with these numbers; empty if the file does not exist.
+        Stamps in ns of the scans with these numbers; [] if the file does not exist.
 
     Raises:
         InputError: the file is malformed, or required and missing.

@@ -1,7 +1,7 @@
 """Result files of KITTI's object and tracking benchmarks.
 
-The object benchmark has one file per frame, with one label line and a score per detection. The
-tracking benchmark has one file per sequence, with frame number and track id before the label.
+Object: one file per frame, with a label line and score per detection. Tracking: one file per
+sequence, with frame number and track id before the label.
 """
 
 from __future__ import annotations
@@ -30,10 +30,8 @@ def find_result_folder(folder: Path) -> Path:
 
 
 def choose_calibration(frame: Frame) -> tuple[Calibration, bool]:
-    """Return the calibration for the result file of a frame, and True if it is a nominal one.
-
-    The nominal camera is used if the frame has no calibration, or an unreadable one.
-    """
+    """Return the calibration of a frame for its result file, else that of a nominal camera and
+    True."""
     try:
         own = frame.calibration()
     except InputError:
@@ -63,9 +61,9 @@ def read_results(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
 
 
 def write_results(path: Path, detections: Detections, calibration: Calibration) -> None:
-    """Write the result file of one frame. Raises InputError if it cannot be written.
+    """Write the result file of one frame. InputError if it cannot be written.
 
-    Truncation and occlusion are -1. The 2D box is projected, 0 outside the image.
+    Truncation and occlusion are -1. The 2D box is projected, and 0 outside the image.
     """
     write_text(path, "".join(format_label(label, DECIMALS) + "\n"
                              for label in _to_result_labels(detections, calibration)))
@@ -89,7 +87,6 @@ def write_tracking_results(path: Path, frames: Iterable[tuple[int, np.ndarray, D
 
 
 def _to_result_labels(detections: Detections, calibration: Calibration) -> list[dict]:
-    """Convert detections to labels of a result file, see write_results."""
     pixels = np.nan_to_num(project_boxes(detections.boxes, calibration)[0])
     extras = [{"score": float(score), "bbox": box.tolist(), "truncated": "-1", "occluded": -1}
               for score, box in zip(detections.scores, pixels)]

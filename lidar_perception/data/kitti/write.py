@@ -91,8 +91,7 @@ def format_tracking_line(number: int, track: int, label: dict) -> str:
 
 
 def format_calibration(calibration: Calibration) -> str:
-    """Return the text of a calib file of the object and tracking layouts, with four identical
-    rectified cameras."""
+    """Return the text of a calib file, with four identical rectified cameras."""
     matrices = {**{f"P{i}": calibration.intrinsics for i in range(4)}, "R0_rect": np.eye(3),
                 "Tr_velo_to_cam": calibration.lidar_to_camera[:3],
                 "Tr_imu_to_velo": IMU_TO_LIDAR}
@@ -105,8 +104,7 @@ def format_numbers(matrix: np.ndarray) -> str:
 
 
 def write_velodyne(path: Path, cloud: np.ndarray) -> None:
-    """Write a cloud (N, 4) [x y z reflectance] as .bin file. Raises InputError if it cannot be
-    written."""
+    """Write a cloud (N, 4) [x y z reflectance] as .bin file. InputError if that fails."""
     write_bytes(path, np.ascontiguousarray(cloud, np.float32).tobytes())
 
 
@@ -118,7 +116,7 @@ def write_object(root: Path, number: int, cloud: np.ndarray, truth: GroundTruth,
 
 def write_object_text(root: Path, number: int, cloud: np.ndarray, labels: str,
                       calibration: Calibration) -> None:
-    """Do the same as write_object, with the text of the label_2 file."""
+    """Write the same as write_object, with the given text of the label_2 file."""
     folder, name = root / "training", f"{number:06}"
     write_velodyne(folder / f"velodyne/{name}.bin", cloud)
     write_bytes(folder / f"calib/{name}.txt", format_calibration(calibration).encode())

@@ -1,9 +1,8 @@
 """nuScenes folders: the key frames of its LiDAR, scene by scene.
 
-The x axis of LIDAR_TOP points to the right and its y axis forward, and it may be slightly tilted.
-Frames here have their origin at the sensor and the axes of the vehicle (x forward, y left, z up):
-points are rotated by the calibration, but not translated, and the ground is sensor_height below the
-origin.
+LIDAR_TOP has x to the right and y ahead, and may be slightly tilted. Frames have their origin at
+the sensor and the axes of the vehicle (x forward, y left, z up): points are rotated by the
+calibration, but not translated, so that the ground is sensor_height below the origin.
 """
 
 from __future__ import annotations
@@ -39,8 +38,7 @@ class KeyFrame:
         token: token of the sample.
         pose: (4, 4) of the frame in the global frame.
         ego: (3,) position of the vehicle in the global frame.
-        labels: returns the labels in the global frame; None if the version has none. The labels of
-            all frames are read together.
+        labels: returns the labels in the global frame; None if the version has none.
     """
 
     token: str
@@ -50,9 +48,9 @@ class KeyFrame:
 
 
 def load_sweep(path: Path, rotation: np.ndarray, stamp_ns: int) -> PointCloud:
-    """Load the usable points of a .pcd.bin file, except those on the vehicle itself.
+    """Load the usable points of a .pcd.bin file that are not on the vehicle itself.
 
-    `rotation` (3, 3) rotates the sensor's axes to those of the frame.
+    rotation: (3, 3) from the sensor's axes to those of the frame.
     """
     cloud = read_records(path, SWEEP)
     off_vehicle = (np.abs(cloud[:, :2]) >= EGO_RADIUS_M).any(axis=1)
@@ -63,8 +61,6 @@ def load_sweep(path: Path, rotation: np.ndarray, stamp_ns: int) -> PointCloud:
 
 
 def _read_truth(key: KeyFrame) -> GroundTruth | None:
-    """Return the labels in the frame, see NuscenesLabels.to_ground_truth; also those without
-    points."""
     labels = key.labels()
     return None if labels is None else labels.to_ground_truth(key.pose)
 
@@ -96,8 +92,7 @@ def _list_versions(root: Path) -> list[str]:
 def open_nuscenes(root: str | Path, version: str = "v1.0-mini") -> list[Frame]:
     """Return the key frames of ROOT/VERSION, in the order of the scene table and of time.
 
-    Sweeps and labels are read later. Raises InputError that names a missing or invalid folder or
-    table.
+    Sweeps and labels are read later. Raises InputError for a missing or invalid folder or table.
     """
     tables = Tables(root, version)
     names = dict(tables.rows("scene", "token", "name"))
@@ -162,8 +157,7 @@ def _read_sweeps(tables: Tables, times: dict[str, int]) -> dict[str, tuple[str, 
 
 
 def _read_poses(tables: Tables, table: str, wanted: set[str]) -> dict[str, np.ndarray]:
-    """Return the poses (4, 4) float64 in a table by token: sensor to vehicle, or vehicle to
-    global."""
+    """Return the poses (4, 4) in a table by token: sensor to vehicle, or vehicle to global."""
     rows = {token: row for token, *row in tables.rows(table, "token", "translation", "rotation")
             if token in wanted}
     if missing := wanted - rows.keys():

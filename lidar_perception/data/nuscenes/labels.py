@@ -22,7 +22,7 @@ from lidar_perception.types import CLASSES, GroundTruth, InputError
 TABLE = "sample_annotation"
 BLOCK_SIZE = 4096  # labels that are converted to columns at a time
 BIKE_RACK = "static_object.bicycle_rack"
-MAX_TIME_S = 1.5   # between two labels from which a velocity is computed; twice that for three
+MAX_TIME_S = 1.5   # between two labels for a velocity; twice as long with one in between
 # In types.CLASSES. A bicycle with a rider is a Cyclist; other classes are Misc.
 CLASS_BY_NAME = {"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian"}
 
@@ -32,7 +32,7 @@ class NuscenesLabels:
     """K labels in the global frame.
 
     Attributes:
-        boxes: their points are those of LiDAR and radar.
+        boxes: boxes with their numbers of LiDAR and radar points.
         categories: (K,) int into category_names.
         lidar_points: (K,) int.
         instances: (K,) int, the same for an object in all frames.
@@ -87,14 +87,14 @@ class NuscenesLabels:
 def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] | None:
     """Read the labels of key frames.
 
-    All frames of a scene must be given, as velocities come from the frames before and after.
+    All frames of a scene must be given, as velocities are computed from neighbouring frames.
 
     Args:
         times: time in us of each key frame, by its sample token.
 
     Returns:
-        The labels of each key frame, in the given order; None if the version has none, as the test
-        split.
+        The labels of each key frame, in the given order; None if the version has none, such as the
+        test split.
 
     Raises:
         InputError: a table is invalid.
@@ -109,7 +109,7 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
     instances = {token: (number, number_of.get(category, -1)) for number, (token, category)
                  in enumerate(tables.rows("instance", "token", "category_token"))}
     own_links, links, in_frames, of_objects, of_categories = (array("q") for _ in range(5))
-    tokens: dict[str, int] = {}  # number of each label, in the order in which they are mentioned
+    tokens: dict[str, int] = {}  # number of each label, in order of first occurrence
     fields = ("translation", "size", "rotation")
     block, blocks = [], []
     for (token, sample, instance, before, after, lidar, radar, labels, *box) in tables.rows(
@@ -180,10 +180,9 @@ def _to_columns(tables: Tables, block: list[tuple]) -> np.ndarray:
 
 def _compute_velocities(centres: np.ndarray, seconds: np.ndarray,
                         neighbours: np.ndarray) -> np.ndarray:
-    """Return velocities (K, 2) m/s from the previous to the next label of the same object.
+    """Compute velocities (K, 2) m/s from the previous to the next label of the same object.
 
-    If one of the two is missing, the label itself takes its place. NaN if both are missing, or if
-    they are too far apart in time.
+    A missing one is replaced by the label itself. NaN if both are missing or too far apart in time.
     """
     own = np.arange(len(centres))
     first, last = (np.where(rows >= 0, rows, own) for rows in neighbours.T)

@@ -48,8 +48,8 @@ def to_results(detections: Detections, frame: Frame) -> GlobalBoxes:
 def write_results(path: Path, results: dict[str, GlobalBoxes]) -> None:
     """Write the boxes by sample token.
 
-    An unknown velocity is NaN, which nuscenes-devkit reads and scores as an error of 1; strict JSON
-    parsers reject it.
+    Unknown velocities are NaN, which nuscenes-devkit scores as an error of 1, but strict JSON
+    parsers reject.
     """
     rows = {token: [{
         **box, "velocity": velocity, "detection_name": NAMES[class_id],
@@ -64,13 +64,7 @@ def write_results(path: Path, results: dict[str, GlobalBoxes]) -> None:
 
 def format_boxes(token: str, centres: np.ndarray, sizes: np.ndarray,
                  rotations: np.ndarray) -> list[dict[str, Any]]:
-    """Return position and size of K boxes of a sample in nuScenes' format, in which sizes are [w l
-    h].
-
-    Args:
-        centres, sizes, rotations: (K, 3), (K, 3) [l w h] and (K, 4) [w x y z], as of
-            to_global_boxes.
-    """
+    """Convert K boxes of a sample, as of to_global_boxes, to nuScenes' format (sizes [w l h])."""
     return [{"sample_token": token, "translation": centre, "size": [width, length, height],
              "rotation": rotation}
             for centre, (length, width, height), rotation in zip(
@@ -78,10 +72,7 @@ def format_boxes(token: str, centres: np.ndarray, sizes: np.ndarray,
 
 
 def read_results(path: Path, frames: Sequence[Frame]) -> dict[str, GlobalBoxes]:
-    """Read the boxes of frames, by frame name. Boxes of other frames are left out.
-
-    Raises InputError that names a missing frame or an invalid box.
-    """
+    """Read the boxes of frames, by frame name. InputError for missing frames or invalid boxes."""
     try:
         content = json.loads(check_regular(path).read_text(encoding="utf-8-sig"))
     except OSError as error:

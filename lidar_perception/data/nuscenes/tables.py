@@ -1,7 +1,7 @@
-"""Tables of nuScenes: JSON lists of rows, read row by row.
+"""Tables of nuScenes: JSON lists of rows.
 
-The tables of trainval have more than a gigabyte, of which LiDAR frames need one percent. Therefore
-rows are decoded from a buffer one after the other, and only the required fields are kept.
+LiDAR frames need one percent of the tables of trainval, which have more than a gigabyte. So rows
+are decoded one by one, and only the required fields are kept.
 """
 
 from __future__ import annotations

@@ -27,10 +27,10 @@ MARKERS, DETECTIONS = "visualization_msgs/msg/MarkerArray", "vision_msgs/msg/Det
 
 
 def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels:
-    """Read the boxes on a topic, MarkerArray or Detection3DArray, of any node.
+    """Read the boxes on a topic of any node, MarkerArray or Detection3DArray.
 
-    Track ids are `track_id` in the text of a label marker, and `id` in that of a track marker. Ids
-    of a Detection3DArray are track ids unless they only number the boxes of each message.
+    Track ids are `track_id` in the text of label markers, and `id` in that of track markers. The
+    ids of a Detection3DArray are track ids unless they only number the boxes of each message.
     """
     stamps = {frame.stamp_ns for frame in frames}
     with Bag(path) as bag:

@@ -27,8 +27,7 @@ def group_by_sequence(frames: Sequence[Frame]) -> dict[str, list[int]]:
 
 
 def list_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[str, Path]:
-    """Return the label file of each drive: `path` itself if it has the suffix, else
-    path/DRIVE.suffix.
+    """Return the label file of each drive: `path` if it has the suffix, else path/DRIVE.suffix.
 
     A drive without a name is 0000. Raises InputError for one file and several drives.
     """
@@ -42,9 +41,9 @@ def list_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[s
 
 
 def find_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[str, Path]:
-    """Return the existing ones of list_drive_files, and `path` itself if it is one of them.
+    """Return the existing files of list_drive_files, and `path` if it is a file.
 
-    Raises InputError as check_label_files does for a folder.
+    For InputError see check_label_files.
     """
     files = list_drive_files(path, frames, suffix)
     if path not in files.values():
@@ -56,8 +55,7 @@ def write_drives(out: Path, frames: Sequence[Frame], suffix: str, force: bool,
                  write: Callable[[Path, str, list[int]], None]) -> None:
     """Call write(file, drive, positions of its frames) for each drive.
 
-    `out` is the file of the only drive if it has the suffix, else a folder that appears when all
-    files are complete.
+    out: file of the only drive if it has the suffix, else a folder, which appears when complete.
     """
     drives = group_by_sequence(frames)
     if out.suffix == suffix:
@@ -71,8 +69,7 @@ def write_drives(out: Path, frames: Sequence[Frame], suffix: str, force: bool,
 
 
 def list_frame_files(folder: Path, frames: Sequence[Frame], suffix: str) -> list[Path]:
-    """Return the label file of each frame, named after it; in a folder per drive if there are
-    several."""
+    """Return the label file of each frame, FRAME.suffix, in a folder per drive if several."""
     several = len(group_by_sequence(frames)) > 1
     return [folder / f"{frame.name if several else frame.name.rpartition('/')[2]}{suffix}"
             for frame in frames]
@@ -119,7 +116,7 @@ def extract_extra(item: dict[str, Any], own_names: Collection[str]) -> dict[str,
 
 
 def assign_track_ids(names: Iterable[str]) -> dict[str, int]:
-    """Return a track id for each name: the number itself if the name is one, else a new number."""
+    """Return a track id for each name: the name if it is a number, else a new number."""
     unique_names = sorted(set(names))
     ids = {name: int(name) for name in unique_names if is_track_number(name)}
     new_ids = itertools.count(max([0, *ids.values()]) + 1)
@@ -127,9 +124,9 @@ def assign_track_ids(names: Iterable[str]) -> dict[str, int]:
 
 
 def collect_track_names(frames: Iterable[FrameLabels], key: str) -> dict[int, str]:
-    """Return the names that tracks had in a file, which are in extra[key].
+    """Return the names of tracks in the file that was read, from extra[key].
 
-    A name is used for one track only, so that the parts of a split track have different names.
+    Each name is used for one track only, so that parts of a split track have different names.
     """
     names: dict[int, str] = {}
     taken = set()
@@ -149,7 +146,7 @@ def is_track_number(name: str) -> bool:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file. Raises InputError with the line of a syntax error."""
+    """Read a JSON file. InputError with the line of a syntax error."""
     text = read_text(path, MAX_BYTES)
     try:
         return json.loads(text)
@@ -177,9 +174,9 @@ def replace_non_finite(value: Any) -> Any:
 
 
 def report_format_errors(where: str, read: Callable[[], Any]) -> Any:
-    """Return read(), which parses a file whose values may be of any type.
+    """Return read(), and convert its errors to InputErrors that name `where`.
 
-    Raises InputError that names `where` and, if a key is missing, the key.
+    For parsers of files whose values may be of any type.
     """
     try:
         return read()

@@ -2,7 +2,7 @@
 
 The development kits' readme files define the columns: location is the centre of the bottom face in
 the rectified camera's frame (x right, y down, z forward), and rotation_y is the rotation about its
-y axis, 0 where the length points to the right. A box that was read and not changed keeps all
+y axis, 0 where the length points to the right. A box that was read and not changed keeps all its
 columns.
 """
 
@@ -72,9 +72,8 @@ def parse_frame_labels(frame: Frame, lines: Sequence[dict[str, Any]], where: obj
 def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str, Any]]:
     """Convert labels to lines for data.kitti.labels.format_label: one per box, then the notes.
 
-    For new and changed boxes the following are computed: alpha, the 2D box (zero outside the
-    image), the truncation, and, if the labels do not state it, the level of occlusion by other
-    boxes.
+    Of new and changed boxes, alpha, the 2D box (zero outside the image), the truncation and, unless
+    given, the level of occlusion by other boxes are computed.
 
     Args:
         levels: truncation is a level, as in the tracking layout, instead of a share.
@@ -108,8 +107,7 @@ def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str
 
 
 def _make_note_line(name: str, extra: dict[str, Any]) -> dict[str, Any]:
-    """Return the line of an object without a 3D box: as it was read, or with the columns of
-    DontCare."""
+    """Return the line of an object without a 3D box: as read, or with the columns of DontCare."""
     kinds = {"bbox": (4,), "dimensions": (3,), "location": (3,)}
     with suppress(KeyError, TypeError, ValueError):
         if all(np.array(extra[c], np.float64).shape == kinds.get(c, ()) for c in COLUMNS):
@@ -129,10 +127,7 @@ def _is_as_read(box: np.ndarray, extra: dict[str, Any], to_lidar: np.ndarray) ->
 
 
 def _is_level(truncated: float, track: int) -> bool:
-    """Return True if a truncation is a level of the tracking layout instead of a share.
-
-    Both layouts use the same column.
-    """
+    """Return True if a truncation is a level, as in the tracking layout, instead of a share."""
     return isinstance(truncated, int) or (track != NO_TRACK and truncated in LEVELS)
 
 
@@ -143,7 +138,7 @@ def _compute_depths(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
 def compute_occlusion_levels(pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
     """Compute the level of occlusion of 2D boxes (K, 4) by nearer ones, given their depths (K,).
 
-    Only labelled objects count as occluders, so a person may know better.
+    Unlabelled occluders are not considered.
 
     Returns:
         (K,) int: 0 visible, 1 partly, 2 largely occluded.

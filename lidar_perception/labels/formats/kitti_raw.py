@@ -1,7 +1,6 @@
-"""Tracklets of KITTI's raw drives, as CVAT and Datumaro export them: one XML file per drive.
+"""Tracklets of KITTI's raw drives, also exported by CVAT and Datumaro: one XML file per drive.
 
-data.kitti.labels.read_tracklets reads the boxes. frame_list.txt in the same folder maps the names
-of frames to their numbers.
+frame_list.txt in the same folder maps the names of frames to their numbers.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ from lidar_perception.types import InputError
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read FILE.xml, a folder with tracklet_labels.xml, or with DRIVE/tracklet_labels.xml of
-    several drives.
+    """Read FILE.xml, or a folder with tracklet_labels.xml or DRIVE/tracklet_labels.xml.
 
     A drive without a file has no labels.
     """

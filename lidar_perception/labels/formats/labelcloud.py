@@ -2,10 +2,9 @@
 
 Rotations are about z, then the rotated y, then the rotated x: in degrees, 0 to 360 (centroid_abs),
 or in radians, -pi to pi (centroid_rel). The length is along the rotated x axis. Vertices go around
-the bottom from the rear right corner over the rear left one, then around the top, as seen by the
-viewer in labelCloud's manual, who looks along y. Numbers have eight decimals, as in labelCloud. It
-reads classes and format from _classes.json in the same folder, and drops unknown fields when it
-saves.
+the bottom from the rear right corner over the rear left one, then around the top, seen along y as
+in labelCloud's manual. Numbers have eight decimals, as in labelCloud. It reads classes and format
+from _classes.json in the same folder, and drops unknown fields when it saves.
 """
 
 from __future__ import annotations

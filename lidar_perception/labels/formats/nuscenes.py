@@ -1,10 +1,8 @@
-"""Result files of nuScenes' detection and tracking tasks: one JSON file with a list of boxes per
-sample.
+"""Result files of nuScenes' detection and tracking tasks: JSON files with boxes by sample.
 
 Boxes are in the global frame, so the recording needs poses. size is [width length height], rotation
-is [w x y z], with x to the front. The token of a frame that is not nuScenes' is its name.
-Additional fields are written next to nuScenes' own and ignored by nuscenes-devkit; unknown classes
-are written under their names and rejected by it.
+is [w x y z], with x to the front. The token of a frame of another recording is its name.
+nuscenes-devkit ignores additional fields and rejects unknown classes, which are written, too.
 """
 
 from __future__ import annotations
@@ -52,7 +50,7 @@ ROOT = "nuscenes"
 NO_SCORE = -1.0    # of labels, as in nuscenes-devkit
 OUR_NAMES = {**CLASS_BY_NAME, **{theirs: ours for ours, theirs in NAME_BY_CLASS.items()}}
 NUSCENES_NAMES = {ours: theirs for theirs, ours in OUR_NAMES.items()}
-# nuScenes' class for those of our classes that it lacks, such as vans; our name is kept as a field.
+# nuScenes' classes for our classes that it lacks, such as vans; our name is written as a field.
 SIMILAR_NAMES = {row.name: NUSCENES_NAMES[row.looks_like] for row in TABLE
                  if row.looks_like in NUSCENES_NAMES}
 WRITTEN_NAMES = {**NUSCENES_NAMES, **SIMILAR_NAMES}
@@ -75,8 +73,7 @@ def _require_pose(frame: Frame) -> np.ndarray:
 
 
 def _read(task: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a file. Boxes of samples that the drive does not have are ignored: a file has many
-    drives."""
+    """Read a file, which may also have boxes of other drives."""
     content = read_json(path)
     results = report_format_errors(str(path), lambda: dict(content["results"]))
     if not results.keys() & {_get_token(frame) for frame in frames}:
@@ -134,8 +131,7 @@ def _to_local_box(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], b
 
 
 def find_read_rotation(labels: FrameLabels, k: int, pose: np.ndarray) -> list[float] | None:
-    """Return the rotation [w x y z] with which a tilted box was read; None if it was moved
-    since."""
+    """Return the rotation [w x y z] with which a tilted box was read; None if it was changed."""
     rotation, box = labels.extra[k].get("rotation"), labels.boxes[k]
     if not isinstance(rotation, list) or len(rotation) != 4:
         return None
@@ -150,8 +146,7 @@ def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
            force: bool = False) -> None:
     """Write one JSON file.
 
-    Missing velocities are computed from the tracks, from frame to frame; NaN, which nuscenes-devkit
-    can read, if that is not possible.
+    Missing velocities are computed from the tracks, else NaN, which nuscenes-devkit can read.
     """
     check_unused(out, force)
     poses = {i: _require_pose(frame) for i, frame in enumerate(frames) if len(labels.frames[i])}
@@ -197,13 +192,9 @@ def _make_columns(task: str, labels: FrameLabels, k: int, pose: np.ndarray,
 
 def _compute_velocities(labels: DriveLabels, frames: Sequence[Frame],
                         poses: dict[int, np.ndarray]) -> dict[tuple[int, int], list[float]]:
-    """Compute velocities in the fixed frame from the previous to the next box of a track.
+    """Compute velocities in m/s in the fixed frame from the previous to the next box of a track.
 
-    Args:
-        poses: poses of the frames with boxes.
-
-    Returns:
-        Velocities [m/s] by frame and box.
+    poses: poses of the frames with boxes. Returns velocities by frame and box.
     """
     tracks: dict[tuple[str, int], list[tuple[int, int]]] = {}
     for i, (each, frame) in enumerate(zip(labels.frames, frames)):

@@ -1,10 +1,9 @@
 """ASAM OpenLABEL 1.0: one JSON file per drive, with cuboids that have a quaternion.
 
-A cuboid is [x y z qx qy qz qw sx sy sz]: its centre, its orientation in its coordinate system, and
-its sizes along its axes. Here, as in ISO 8855, x is along the length to the front, y to the left, z
-up, in the LiDAR's coordinate system. Frames have the numbers that they have in the drive. All other
-content of a file is kept: that of a cuboid in FrameLabels.extra, that of the drive in
-DriveLabels.extra.
+A cuboid is [x y z qx qy qz qw sx sy sz]: centre, orientation in its coordinate system, and sizes
+along its axes. We write x along the length to the front, y to the left and z up, as in ISO 8855, in
+the LiDAR's coordinate system. Frame numbers are those of the drive. All other content of a file is
+preserved, that of a cuboid in FrameLabels.extra, that of the drive in DriveLabels.extra.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ from lidar_perception.types import InputError
 
 SUFFIX, ROOT = ".json", "openlabel"
 # Attributes of a cuboid, and keys in FrameLabels.extra: attributes that are not plain values, data
-# of the object, and the original cuboid, which is written again unless it was moved.
+# of the object, and the original cuboid, which is written unless the box was moved.
 SCORE, TRACKED, TYPE = "confidence", "tracked", "type"
 UID, OTHER, OBJECT = "uid", "openlabel_attributes", "openlabel_data"
 REGION = "openlabel_region"  # data of an object whose 2D boxes became notes with KITTI's columns
@@ -115,11 +114,8 @@ def _read_drive(path: Path, frames: list[Frame],
 
 def _make_region_notes(kind: str, uid: str,
                        data: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
-    """Return notes of an object without a cuboid.
-
-    There is one note with KITTI's columns per 2D box, the first of which holds the data; without 2D
-    boxes, one note of the data.
-    """
+    """Return notes of an object without a cuboid: one with KITTI's columns per 2D box, of which the
+    first has the data, or without 2D boxes, one of the data."""
     values, rest = parts.parse_named_values(data)
     columns = {name: DONT_CARE[name] for name in COLUMNS if name in DONT_CARE}
     notes = [(kind, {**columns, **values, "bbox": box, UID: uid, REGION: {} if k else data})
@@ -136,7 +132,7 @@ def _parse_track(cuboid: dict[str, Any], kind: str, number: int) -> tuple[str, i
 
 
 def _parse_extra(cuboid: dict[str, Any], box: list[float], plain: bool) -> dict[str, Any]:
-    """Return the extra fields of a cuboid; `plain` if its box describes it completely."""
+    """Return the extra fields of a cuboid; `plain` means that its box describes it completely."""
     values, rest = parts.parse_named_values(cuboid.get("attributes", {}))
     extra = {name: v for name, v in values.items() if name not in (SCORE, TRACKED, TYPE)}
     extra |= {OTHER: rest} if rest else {}
@@ -157,11 +153,8 @@ def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool =
 
 def _make_content(labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[int],
                   kept: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of the file of a drive.
-
-    Args:
-        kept: content of the file that the labels were read from, without its cuboids.
-    """
+    """Return the content of the file of a drive. kept: that of the file which was read, without
+    cuboids."""
     own = [(frames[i], labels.frames[i]) for i in positions]
     named_tracks = collect_track_names((frame_labels for _, frame_labels in own), UID)
     note_uids = {str(note[UID]) for _, frame_labels in own for _, note in frame_labels.notes

@@ -1,8 +1,7 @@
 """Parts of OpenLABEL files: coordinate systems, cuboids in them, and named values.
 
-A coordinate system has a parent and its pose there (pose_wrt_parent), or a frame has a transform
-between two systems. A value is {"name": ..., "val": ...} in a list of its kind: num, text, boolean,
-vec.
+A coordinate system has a pose in its parent (pose_wrt_parent), or a frame has a transform between
+the two. A value is {"name": ..., "val": ...} in a list of its kind: num, text, boolean, vec.
 """
 
 from __future__ import annotations
@@ -64,8 +63,7 @@ def has_size(cuboid: dict[str, Any]) -> bool:
 
 
 def find_regions(data: dict[str, Any]) -> list[list[float]]:
-    """Return the 2D boxes [left top right bottom] of an object's data, in pixels of its first
-    camera."""
+    """Return the 2D boxes [left top right bottom] of an object in pixels of its first camera."""
     boxes = [box for box in data.get("bbox", ()) if len(box["val"]) == 4]
     cameras = [box.get("coordinate_system") for box in boxes]
     return [[x - w / 2, y - h / 2, x + w / 2, y + h / 2] for box, camera in zip(boxes, cameras)
@@ -88,9 +86,9 @@ def find_transform_to_lidar(name: str, systems: dict[str, Any], frame: dict[str,
                             where: str) -> np.ndarray:
     """Return the transform (4, 4) from a coordinate system ("" for the LiDAR's) to the LiDAR's.
 
-    It follows from the poses of the systems and of the frame, or else from the recording's pose.
-    For a camera in a file without a LiDAR, it follows from the recording's calibration. Raises
-    InputError if the systems are not connected.
+    It is computed from the poses of the systems and of the frame, else from the recording's pose;
+    for a camera in a file without a LiDAR, from the recording's calibration. Raises InputError if
+    the systems are not connected.
     """
     lidar = find_lidar_system(systems, where)
     if name in ("", lidar):
@@ -156,10 +154,8 @@ def _parse_transform(data: dict[str, Any]) -> np.ndarray:
 
 
 def make_coordinate_systems(frames: Sequence[Frame]) -> dict[str, Any]:
-    """Return coordinate_systems and streams of a drive: the LiDAR's, a fixed one and the camera's.
-
-    The last two exist only if the recording has poses and a camera.
-    """
+    """Return coordinate_systems and streams of a drive: the LiDAR, and if the recording has them, a
+    fixed system and the camera."""
     calibration = frames[0].calibration() if frames else None
     has_poses = bool(frames) and frames[0].pose() is not None
     lidar: dict[str, Any] = {"type": "sensor_cs", "parent": FIXED if has_poses else "",
@@ -188,8 +184,7 @@ def make_transforms(frame: Frame) -> dict[str, Any]:
 
 
 def to_named_values(values: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Convert a JSON object to named values by kind; values of other kinds become text
-    NAME.json."""
+    """Convert a JSON object to named values by kind; other values become a text NAME.json."""
     values_by_kind: dict[str, list[dict[str, Any]]] = {}
     for name, value in values.items():
         kind = next((kind for kind, fits in KINDS.items() if fits(value)), "")
@@ -214,7 +209,7 @@ def parse_named_values(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str,
 
 
 def _is_number(value: Any) -> bool:
-    """Return True for numbers that other readers can represent, unlike integers of 400 digits."""
+    """Return True for numbers within the range of float64, as other readers require."""
     return (isinstance(value, int | float) and not isinstance(value, bool)
             and abs(value) <= sys.float_info.max)
 

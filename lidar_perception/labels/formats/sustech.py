@@ -42,10 +42,7 @@ OWN = {"psr", "obj_type", "obj_id", "score"}
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a folder with FRAME.json, or that of a scene with label/.
-
-    A frame without a file has no labels.
-    """
+    """Read a folder with FRAME.json or label/FRAME.json. A frame without a file has no labels."""
     path = path / "label" if (path / "label").is_dir() else path
     files = list_frame_files(path, frames, SUFFIX)
     check_label_files(path, files, SUFFIX)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.camera import Calibration
-from lidar_perception.data.drives import is_same_drive
+from lidar_perception.data.frame import is_same_drive
 from lidar_perception.scoring.recorded import RecordedResult
 from lidar_perception.scoring.tracking.pairs import to_tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
