@@ -6,7 +6,7 @@
     for frame in lp.open_recording("drive.bag"):
         print(detector(frame.load()).detections.boxes)
 
-The names in `__all__` are the public interface. Each is imported when it is first used.
+The names in `__all__` are the public interface. They are imported when they are first used.
 """
 
 import importlib

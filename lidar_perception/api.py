@@ -1,4 +1,4 @@
-"""Functions of the public interface: keyword arguments in place of parameter dataclasses."""
+"""Functions of the public interface, with keyword arguments instead of parameter dataclasses."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def load_detector(name_or_file: str | Path = FUSED, *, device: str = "auto", ran
         range: ahead, around, or auto, the range that the weights were trained for.
         sensor_height: height of the sensor above the ground in metres. Default: 1.73, as in KITTI.
         min_score: threshold of every class, 0..1. Default: those of the detector.
-        settings: other parameters by their dotted names, such as {"fused.scores.car": 0.7}. They
-            take precedence over the arguments above.
+        settings: other parameters by dotted name, such as {"fused.scores.car": 0.7}, which take
+            precedence over the arguments above.
 
     Raises:
         InputError: the detector cannot be loaded, or an argument is unknown or out of range.
@@ -79,8 +79,8 @@ def segment_ground(xyz: PointCloud | ArrayLike, method: str = "threshold", *,
         method: threshold (one plane), patchwork (Patchwork++) or cloth (cloth simulation).
         sensor_height: height of the sensor above the ground, in metres.
         intensity: (N,) if xyz is (N, 3); only patchwork uses it, to remove reflections.
-        params: parameters of the method, such as max_range=60.0 of patchwork. They are those of
-            the node ground_segmentation without their prefix ground.METHOD.
+        params: parameters of the method, such as max_range=60.0 of patchwork: those of the node
+            ground_segmentation without the prefix ground.METHOD.
 
     Returns:
         (N,) bool, True = ground. Points that are not finite and points at the origin are not
@@ -107,10 +107,10 @@ def cluster(xyz: PointCloud | ArrayLike, method: str = "dbscan", *,
         xyz: (N, 3) [x y z] or (N, 4) [x y z intensity], metres; or a PointCloud.
         method: dbscan (eps grows with the range) or euclidean (adaptive).
         ground: (N,) bool; True = not clustered. Default: all points are clustered.
-        density: points per square degree of view for which the parameters are meant; they adapt
-            to sparser clouds. 0: they are used unchanged.
-        params: parameters of the method, such as min_samples=5 of dbscan. They are those of the
-            node clustering without their prefix clustering.METHOD.
+        density: points per square degree of view for which the parameters are meant; they are
+            adapted to sparser clouds. 0: no adaptation.
+        params: parameters of the method, such as min_samples=5 of dbscan: those of the node
+            clustering without the prefix clustering.METHOD.
 
     Returns:
         (N,) int32 ids: 1..K for the clusters, 0 for ground and points without a cluster.
@@ -138,12 +138,12 @@ def find_candidates(xyz: PointCloud | ArrayLike, *, click: ArrayLike | None = No
     Args:
         xyz: (N, 3) [x y z] or (N, 4) [x y z intensity], metres, z up; or a PointCloud.
         click: (3,) a point on a pedestrian, whose silhouette becomes the template. Default: the
-            cluster that is most likely a pedestrian, or else the template of the package.
+            cluster that is most likely a pedestrian, else the template of the package.
         sensor_height: height of the sensor above the ground, in metres.
         ground: (N,) bool, such as from segment_ground(). Default: segmented here.
         cluster_ids: (N,) int, such as from cluster(). Default: clustered here.
-        settings: other parameters by their dotted names, such as {"stm.threshold": 0.5}; they are
-            those of the node perception.
+        settings: other parameters of the node perception by dotted name, such as
+            {"stm.threshold": 0.5}.
 
     Returns:
         Pedestrians with the confidence as score; K = 0 without any.
@@ -166,12 +166,12 @@ def evaluate(detector: str | Path | Detector | Callable[[PointCloud], Detections
     """Score a detector on the labelled frames of a recording, as `evaluate detection` does.
 
     Args:
-        detector: a loaded detector, anything that returns Detections for a PointCloud, or what
-            load_detector() takes. The last is opened for the height of the recording's sensor.
+        detector: a loaded detector, a function that returns Detections for a PointCloud, or a name
+            or file for load_detector(), which is loaded for the recording's sensor height.
         recording: an open recording, or its path.
         limit: number of frames. Default: all.
-        min_score: threshold of every class. Average precision needs boxes of low score; None
-            keeps the detector's thresholds.
+        min_score: threshold of every class, low as average precision needs boxes of low score;
+            None: those of the detector.
         intervals: number of bootstrap resamples for 90 % intervals; 0: none.
 
     Returns:
@@ -210,7 +210,7 @@ def evaluate(detector: str | Path | Detector | Callable[[PointCloud], Detections
 def simulate(frames: int = 40, seed: int = 1, sensor: str = "hdl64e", scene: str = "street", *,
              kind: str | None = None, people: float = 1.0,
              sensor_height: float | None = None) -> Recording:
-    """Simulate labelled scans; each is computed when it is read.
+    """Simulate labelled scans, which are computed when they are read.
 
     Args:
         frames: number of scans. A new scene starts after the 20 s of a drive.
@@ -242,11 +242,6 @@ def _make_cloud(xyz: PointCloud | ArrayLike, intensity: ArrayLike | None) -> Poi
 
 
 def _set_params(params: P, values: Mapping[str, Any]) -> P:
-    """Return the parameters with these values.
-
-    Raises:
-        InputError: a name is unknown, or a value is out of range.
-    """
     try:
         return with_values(params, values)
     except ValueError as error:

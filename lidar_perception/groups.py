@@ -1,4 +1,4 @@
-"""Points grouped by cluster. Time and memory depend on the number of points, not on the ids."""
+"""Grouping of points by cluster, in time and memory that do not depend on the ids."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Groups(NamedTuple):
 
 
 def group_by_id(ids: np.ndarray, min_points: int = 1) -> Groups:
-    """Group points by id (N,) int, ascending; ids of 0 and below belong to no cluster.
+    """Group points by id (N,) int, ascending; ids up to 0 mean no cluster.
 
     Clusters of fewer than min_points points are left out.
     """
@@ -47,8 +47,8 @@ def count_clusters(labels: np.ndarray) -> int:
     """Return K, the largest of labels (N,), which are 0 or 1..K.
 
     Raises:
-        InputError: if K is larger than N, because arrays of K rows would then need memory that an
-            id decides on. renumber_ids() makes ids without gaps.
+        InputError: K is larger than N, so that arrays of K rows could exceed the memory.
+            renumber_ids() makes ids without gaps.
     """
     count = int(labels.max(initial=0))
     if count > len(labels):
@@ -61,7 +61,9 @@ def group_points(xyz: np.ndarray, labels: np.ndarray,
                  wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the points (M, 3) of clusters, cluster after cluster, and the start (K + 1,) of each.
 
-    labels (N,) are 0 for no cluster, at most N; wanted (K,) are the clusters, without duplicates.
+    Args:
+        labels: (N,) ids, 0 for no cluster, at most N.
+        wanted: (K,) ids of the clusters, without duplicates.
     """
     place = np.full(count_clusters(labels) + 1, -1)
     place[wanted] = np.arange(len(wanted))
@@ -75,8 +77,8 @@ def group_points(xyz: np.ndarray, labels: np.ndarray,
 def renumber_ids(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Renumber cluster ids of any source to 1..K without gaps.
 
-    Ids of 0, below 0 and not finite mean no cluster, and so does 2^32 - 1 as uint32, because some
-    nodes write -1 for noise.
+    Ids that are not finite or not above 0 mean no cluster, and so does 2^32 - 1 as uint32, which
+    some nodes write for -1.
 
     Args:
         ids: (N,) integers, or floats with integer values.

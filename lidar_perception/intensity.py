@@ -1,8 +1,7 @@
 """Scale of intensities: drivers write 0..1, percent, 8, 10, 12 or 16 bits; the core uses 0..1.
 
-Every source uses `infer_full_scale`, which infers a scale that is not declared, and `to_unit`,
-which applies it. See docs/reference/recordings.md#intensity. Networks read the result of
-`normalize_intensity`.
+`infer_full_scale` infers a scale that is not declared, and `to_unit` applies it. See
+docs/reference/recordings.md#intensity. Networks read the result of `normalize_intensity`.
 """
 
 from __future__ import annotations
@@ -16,11 +15,11 @@ BITS = (255.0, 1023.0, 4095.0, 65535.0)  # 8, 10, 12 and 16 bits
 TOLERANCE = 1.001      # factor by which rounding lets a value exceed its scale
 MAX_OUTLIERS = 1e-4    # share of the values of a cloud that may exceed its scale
 WHOLE_SAMPLE = 10_000  # number of values that are checked for being whole numbers
-MIN_BRIGHT = 0.05      # a cloud of MIN_POINTS points with lower values only has another scale
+MIN_BRIGHT = 0.05      # of the highest intensity in a cloud of at least MIN_POINTS points
 MIN_POINTS = 1000
 MIN_KNOWN = 0.1        # share of the points that must have an intensity for it to be usable
-# Distribution of positive intensities that networks read: shares, and the values that these shares
-# do not exceed; as of an HDL-64E in towns.
+# Distribution of positive intensities that networks read, as of an HDL-64E in towns: shares of the
+# points, and the intensity that each share does not exceed.
 REFERENCE_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98,
                     0.99, 0.995, 1.0)
 REFERENCE_VALUES = (0.01, 0.05, 0.09, 0.135, 0.185, 0.225, 0.26, 0.285, 0.31, 0.335, 0.37, 0.42,
@@ -29,17 +28,17 @@ INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # a cloud's first one cou
 
 
 def infer_full_scale(values: np.ndarray, dtype: DTypeLike | None = None) -> float:
-    """Infer from one cloud which value means a full reflection.
+    """Infer the intensity of a full reflection from one cloud.
 
-    8-bit integers: the largest number of their type. Wider integers: the smallest of 255, 1023,
-    4095 and 65535 that is not exceeded. Floats: 1 if MAX_UNIT is not exceeded; 100 (percent) if 100
-    is not exceeded and there are fractions; else as for integers. Without values, or with zeros
-    only, the smallest scale of the type.
+    8-bit integers: the largest number of their type. Wider integers: the smallest of BITS that is
+    not exceeded. Floats: 1 if MAX_UNIT is not exceeded; 100 (percent) if 100 is not exceeded and
+    there are fractions; else as for integers. Without values above 0, the smallest scale of the
+    type.
 
     Args:
-        values: (N,) intensities as the driver wrote them. NaN, infinite and negative values do not
-            count, nor does a share of MAX_OUTLIERS.
-        dtype: type in which the driver wrote them, if `values` have been converted.
+        values: (N,) intensities as the driver wrote them. NaN, infinite and negative values are
+            ignored, and a share of MAX_OUTLIERS may exceed the scale.
+        dtype: type in which the driver wrote them, if `values` were converted.
     """
     kind = np.dtype(values.dtype if dtype is None else dtype)
     if kind.kind in "iu" and kind.itemsize == 1:
@@ -65,7 +64,7 @@ def _exceeds(values: np.ndarray, limit: float) -> bool:
 def to_unit(values: np.ndarray, full: float) -> np.ndarray:
     """Divide intensities by the value of a full reflection; return (N,) float32, 0..1.
 
-    NaN, infinite and negative values become 0. Values above `full` stay above 1, so that
+    NaN, infinite and negative values become 0. Values above `full` exceed 1, so that
     find_scale_problem can report them.
     """
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes inf
@@ -80,8 +79,8 @@ def normalize_intensity(intensity: np.ndarray | None,
                         indices: np.ndarray | None = None) -> np.ndarray | None:
     """Map the intensities of a cloud to the distribution that networks are trained with.
 
-    The result depends on the order of the intensities only, so that gain, gamma and scale of the
-    sensor have no effect. Zeros stay zeros, as sensors report them for the weakest returns.
+    The result depends only on the order of the intensities, so gain, gamma and scale of the sensor
+    have no effect. Zeros, which sensors report for the weakest returns, stay 0.
 
     Args:
         intensity: (N,) intensities, NaN for unknown ones, or None.
@@ -93,7 +92,7 @@ def normalize_intensity(intensity: np.ndarray | None,
     if intensity is None or not has_usable_intensity(intensity):
         return None
     knots = _compute_quantiles(intensity[intensity > 0], np.array(REFERENCE_SHARES))
-    # Of equal knots, the middle one counts: np.interp needs them to rise.
+    # np.interp needs ascending knots, so equal ones are replaced by their middle.
     unique, inverse = np.unique(knots, return_inverse=True)
     middles = np.bincount(inverse, REFERENCE_VALUES) / np.bincount(inverse)
     if indices is not None:
@@ -117,8 +116,7 @@ def _compute_quantiles(values: np.ndarray, shares: np.ndarray) -> np.ndarray:
 def has_usable_intensity(intensity: np.ndarray | None) -> bool:
     """Return True if networks can read the intensities (N,) of a cloud.
 
-    They cannot if there are none, if fewer than MIN_KNOWN of them are positive, or if nearly all
-    positive ones are equal.
+    At least a share of MIN_KNOWN must be positive, and positive ones must not be nearly all equal.
     """
     if intensity is None:
         return False
@@ -131,25 +129,21 @@ def has_usable_intensity(intensity: np.ndarray | None) -> bool:
 
 
 class StreamScale:
-    """Scale of a stream of clouds: the largest that infer_full_scale() found for any of them.
-
-    A single dark cloud is therefore not read in another scale. `full` is 0 before the first cloud.
+    """Scale of a stream of clouds: the largest scale of a cloud so far, so that a dark cloud is not
+    read in another scale. `full` is 0 before the first cloud.
     """
 
     def __init__(self) -> None:
         self.full = 0.0
 
     def __call__(self, values: np.ndarray, dtype: DTypeLike | None = None) -> float:
-        """Return the scale of the stream including this cloud; arguments of infer_full_scale."""
+        """Return the scale of the stream including this cloud; see infer_full_scale."""
         self.full = max(self.full, infer_full_scale(values, dtype))
         return self.full
 
 
 def find_scale_problem(intensity: np.ndarray | None) -> str | None:
-    """Describe a wrong scale of intensities (N,) that should be 0..1, with the remedy.
-
-    None if the scale is right or there is no intensity.
-    """
+    """Describe a wrong scale of intensities (N,) that should be 0..1, with the remedy, or None."""
     if intensity is None:
         return None
     greatest = float(np.fmax.reduce(intensity, initial=0))

@@ -1,7 +1,7 @@
-"""Calibrate the scores of weights to probabilities, on scans that they were not trained on.
+"""Calibrate the scores of weights to probabilities, on scans that were not used for training.
 
-The lines in the headers are fitted; the weights and the order of the scores stay. A file stays
-unchanged if one of its classes has too few objects in the scans.
+Only the calibration in the header of a file changes, not the order of the scores. A file stays
+unchanged if the scans have too few objects of one of its classes.
 
     lidar-perception simulate --format kitti --frames 360 --people 2.5 --seed 700000 --out scans
     python scripts/calibrate_weights.py scans v4.safetensors pointnet.safetensors

@@ -1,6 +1,6 @@
 """Fit candidates/confidence.json to simulated scans: two additive models of log-odds.
 
-One uses the shape of a cluster, the other also its similarity to a seed.
+One model uses the shape of a cluster, the other also its similarity to a seed.
 
     lidar-perception simulate --format kitti --frames 400 --people 2 --seed 6000 --out scans
     python scripts/fit_confidence.py scans
@@ -46,10 +46,9 @@ def select_pedestrians(frame: Frame) -> np.ndarray:
 
 
 def collect_samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | None:
-    """Return features of the clusters of a frame, compared with a seed of another frame.
+    """Return the features of K clusters compared with a seed of another frame; None for K = 0.
 
-    Also hit (K,) bool, and range bins of the clusters and of the pedestrians. None without
-    clusters. A seed from the same frame would carry no information.
+    Also returns `hit` (K,) bool, and range bins of the clusters and of the pedestrians.
     """
     truth = select_pedestrians(frame)
     segmented = segment_cloud(frame.load(), frame.camera(), params)
@@ -69,7 +68,7 @@ def collect_samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | 
 
 
 def find_seed(job: tuple[str, int]) -> Seed | None:
-    """Return the nearest pedestrian of a frame, as in the paper's protocol."""
+    """Return the nearest pedestrian of a frame as seed, as in the paper's protocol, or None."""
     frame = open_recording(job[0]).frames[job[1]]
     try:
         segmented = segment_cloud(frame.load(), frame.camera(), BEST)

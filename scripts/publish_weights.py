@@ -5,8 +5,8 @@
     python scripts/publish_weights.py v4/best.safetensors --mean-with before.safetensors simulated
     python scripts/publish_weights.py --card pointnet.safetensors /data/kitti/object
 
-The card has the training data, classes, range, sensor, figures with intervals on each folder, known
-failures and licence. No folder may have been used for training.
+The card states training data, classes, range, sensor, figures with intervals on each folder, known
+failures and licence. The folders must not have been used for training.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ JUDGE_NOTE = ("Use: classifies the boxes that PointPillars proposes in `fused`. 
 
 
 def evaluate_weights(weights: Path, folder: Path) -> dict[str, Any]:
-    """Return the results of `evaluate detection --intervals` as JSON data."""
+    """Return the results of `evaluate detection --intervals`, as in its JSON file."""
     recording = open_recording(folder)
     report = DetectionReport(follow=recording.is_sequential)
     fill(report, recording, partial(
@@ -112,7 +112,7 @@ def describe_weights(header: checkpoint.Header, title: str) -> list[str]:
 
 
 def format_figures(name: str, content: dict[str, Any], classes: tuple[str, ...]) -> list[str]:
-    """Return the section about one data set as lines of Markdown."""
+    """Return the section of the card about one data set, as lines of Markdown."""
     lines = [f"## {name}: {content['frames']} frames", "",
              f"AP in percent (R40, moderate), with the {INTERVAL_PERCENT} % interval of {SAMPLES} "
              "bootstrap samples where it is computed, and the number of labels in brackets.", "",

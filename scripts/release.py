@@ -23,12 +23,12 @@ def set_version(root: Path, version: str) -> None:
         path = root / name
         text, count = re.subn(pattern, rf"\g<1>{version}", path.read_text())
         if count != 1:
-            raise SystemExit(f"{path} states {count} versions where one is expected")
+            raise SystemExit(f"{path} states {count} versions instead of one")
         path.write_text(text)
 
 
 def dated_changelog(text: str, version: str, day: str) -> str:
-    """Return the changelog with the unreleased changes under the version, without empty parts."""
+    """Move the unreleased changes of a changelog to a section of the version."""
     match = re.search(r"(?ms)^## Unreleased\n(.*?)(?=^## |\Z)", text)
     if match is None:
         raise SystemExit("CHANGELOG.md has no section 'Unreleased'")

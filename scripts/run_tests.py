@@ -2,9 +2,9 @@
 
 Without arguments: ruff, mypy, the documentation site and all tests. The tests of the core run on
 all cores, and two more processes run the tests that mostly wait for other processes. Numba compiles
-once before them, while ruff and mypy run. Coverage must reach the limit in setup.cfg. It is not
-measured in nodes that run in their own processes, nor in long tests that repeat the lines of
-others, such as those of Hypothesis, because measuring doubles their time.
+once before the tests, while ruff and mypy run. Coverage must reach the limit in setup.cfg. It is
+not measured in nodes with their own processes, nor in long tests of lines that others cover, as
+this doubles their time.
 
     ./lidar test
     ./lidar test -k clustering -x
@@ -26,11 +26,11 @@ from lidar_perception.runs.threads import default_to_one_thread, use_passive_wai
 ROOT = Path(__file__).resolve().parents[1]
 MAX_WORKERS = 4  # each loads torch and compiles
 NODE_WORKERS = 2  # for tests that mostly wait
-# Their folders and files, those with the slowest tests first.
+# Folders and files of these tests, the slowest first.
 WITH_PROCESSES = ("test/testing", "test/fuzz",
                   "test/studio/test_label_server.py", "test/studio/test_page.py",
                   "test/studio/test_page_saves.py", "test/launch", "test/ros")
-# Numba caches what these compile, so that each test process loads it.
+# Programs that fill Numba's cache, from which the test processes load.
 COMPILE = ("""
 from lidar_perception.candidates.warm_up import warm_up
 warm_up()
@@ -81,15 +81,15 @@ def run_everything(folder: Path) -> list[str]:
     """
     default_to_one_thread()  # as many processes as cores
     environment = {**os.environ, "COVERAGE_FILE": str(folder / "coverage")}
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # compiled once, not in each process
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # so that each module is compiled once
     if sys.version_info >= (3, 12):
-        environment["COVERAGE_CORE"] = "sysmon"  # lines are noticed once, and then cost nothing
+        environment["COVERAGE_CORE"] = "sysmon"  # each line costs time only once
     pytest = ("-m", "pytest", "--cov", "--cov-report=", "--cov-fail-under=0")
     nodes = [name for name in WITH_PROCESSES if (ROOT / name).exists()]
     workers = min(os.cpu_count() or 1, MAX_WORKERS)
     running = {"ruff": BackgroundCommand("-m", "ruff", "check"),
                "mypy": BackgroundCommand("-m", "mypy")}
-    *parts, last = COMPILE  # their failures show up in the tests
+    *parts, last = COMPILE  # if they fail, so do the tests
     for compiling in [BackgroundCommand("-c", part) for part in parts]:
         compiling.failed()
     BackgroundCommand("-c", last).failed()
@@ -112,8 +112,8 @@ def run_everything(folder: Path) -> list[str]:
 def _distributed(workers: int) -> tuple[str, ...]:
     """Return the options of pytest for this many processes.
 
-    Whole files are distributed in their order; sorted by number of tests, the slowest would end up
-    last.
+    Whole files are distributed in their order. pytest-xdist would sort them by their number of
+    tests, and the slowest would come last.
     """
     return "-n", str(workers), "--dist", "loadfile", "--no-loadscope-reorder"
 

@@ -1,10 +1,10 @@
-"""Install this checkout and its pinned packages into the environment of the Python that runs this.
+"""Install this checkout and its pinned packages into the environment of the running Python.
 
     python scripts/set_up.py EXTRA...
 
-./lidar calls it. uv installs in seconds what takes pip minutes, but does not read pip's
-configuration, so it is handed over. uv is the one on PATH, or it is installed by pip. pip installs
-everything where there is no uv, where uv fails, and where pip has settings that uv lacks.
+./lidar calls it. It installs with uv, which is much faster than pip and gets pip's settings as
+options. uv is found on PATH or installed by pip. If uv fails or lacks one of the settings, pip
+installs everything.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 CONSTRAINTS = ROOT / "constraints.txt"
 PIP = [sys.executable, "-m", "pip"]
-# Options of uv for settings of pip that hold one or more values, separated by whitespace.
+# Options of uv for settings of pip with one or more values, separated by whitespace.
 OPTIONS = {"find-links": "--find-links", "index-url": "--default-index",
            "extra-index-url": "--index", "constraint": "--constraint",
            "trusted-host": "--allow-insecure-host", "only-binary": "--only-binary",
@@ -49,7 +49,7 @@ def main(extras: list[str]) -> int:
 
 
 def read_pip_settings() -> dict[str, str]:
-    """Return the settings of `pip install` by name, from its files and the environment."""
+    """Return the settings of `pip install` by name, from its files and environment variables."""
     listed = subprocess.run([*PIP, "config", "list"], capture_output=True, text=True).stdout
     by_section: dict[str, dict[str, str]] = {"global": {}, "install": {}, ":env:": {}}
     for line in listed.splitlines():
@@ -61,12 +61,12 @@ def read_pip_settings() -> dict[str, str]:
 
 
 def find_uv_options(settings: dict[str, str]) -> tuple[list[str], dict[str, str]] | None:
-    """Return options and environment variables of uv for settings of pip, None if uv lacks one."""
-    options = ["--index-strategy", "unsafe-best-match"]  # as pip: the best of all indexes
+    """Return options and environment variables of uv for settings of pip; None if uv lacks one."""
+    options = ["--index-strategy", "unsafe-best-match"]  # as pip, which compares all indexes
     variables = {}
     for name, value in settings.items():
         if name in OPTIONS:
-            options += [word for each in value.split() for word in (OPTIONS[name], each)]
+            options += [word for item in value.split() for word in (OPTIONS[name], item)]
         elif name in VARIABLES:
             variables[VARIABLES[name]] = value
         elif name == "no-index":
@@ -87,10 +87,10 @@ def find_uv() -> str | None:
 
 
 def find_torch() -> list[str]:
-    """Return the requirement for the file of torch that pip would install, for example a CPU build;
-    nothing if torch is installed, or if pip cannot tell.
+    """Return the requirement for the file of torch that pip would install, such as a CPU build.
 
-    Several indexes can have builds with the same version, of which uv could choose another.
+    uv may choose another build of the same version if there are several indexes. [] if torch is
+    installed; if pip finds no file, it installs torch.
     """
     try:
         version("torch")

@@ -109,7 +109,7 @@ def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Ca
     if not any(layout.is_layout(recording.path) for layout in (bag_frames, cloud_folder)):
         raise InputError(f"{recording.path} ({recording.layout}) has level clouds; --robot and "
                          "--deskew are for bags and files of clouds")
-    from lidar_perception.data.levelled import SensorMount, level_frame
+    from lidar_perception.data.levelling import SensorMount, level_frame
     robot = SensorMount()
     if file is not None:
         robot, asked = _read_mount(file)
@@ -131,7 +131,7 @@ def _read_mount(file: Path) -> tuple[Any, bool]:
     """Return the SensorMount of a parameter file, and whether it enables deskewing."""
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
-    from lidar_perception.data.levelled import SensorMount
+    from lidar_perception.data.levelling import SensorMount
     from lidar_perception.param_fields import with_values
     from lidar_perception.params import CloudNodeParams
     try:

@@ -10,7 +10,7 @@ from samples import STAMP, calibration_text, write
 
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.levelled import SensorMount, level_frame
+from lidar_perception.data.levelling import SensorMount, level_frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.semantickitti import write_scan
 from lidar_perception.data.to_bag import write_bag

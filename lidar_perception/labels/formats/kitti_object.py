@@ -22,7 +22,7 @@ ZEROS = re.compile(r"(\.\d\d\d*?)0+(?=\s|$)")
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a folder with FRAME.txt, or of the object layout; frames without a file have no labels."""
+    """Read a folder with FRAME.txt, or of the object layout. Frames may have no file."""
     path = find_label_folder(path, "label_2")
     files = list_frame_files(path, frames, ".txt")
     check_label_files(path, files, ".txt")
