@@ -142,7 +142,7 @@ def as_point_cloud(cloud: PointCloud | ArrayLike, intensity: ArrayLike | None = 
     """
     if isinstance(cloud, PointCloud):
         return cloud
-    points = _numbers(cloud, "a cloud", "a PointCloud (frame.load() of a recorded frame, "
+    points = _to_numbers(cloud, "a cloud", "a PointCloud (frame.load() of a recorded frame, "
                       "to_point_cloud of a PointCloud2) or numbers (N, 3) [x y z] or (N, 4) "
                       "[x y z intensity]")
     if points.shape == (0,):
@@ -161,7 +161,7 @@ def as_point_cloud(cloud: PointCloud | ArrayLike, intensity: ArrayLike | None = 
         raise InputError(f"intensity_max is {intensity_max:g}; it must be above 0: 1, 100 or 255 "
                          "for most drivers")
     values = points[:, 3] if points.shape[1] == 4 else (
-        None if intensity is None else _numbers(intensity, "intensity", "(N,) numbers"))
+        None if intensity is None else _to_numbers(intensity, "intensity", "(N,) numbers"))
     if values is not None:
         full = intensity_max or (255.0 if values.dtype == np.uint8 else 1.0)
         values = to_unit(values, full)
@@ -170,15 +170,15 @@ def as_point_cloud(cloud: PointCloud | ArrayLike, intensity: ArrayLike | None = 
     return PointCloud(xyz, values, stamp_ns, frame_id)
 
 
-def _numbers(given: Any, what: str, allowed: str) -> np.ndarray:
+def _to_numbers(array: Any, what: str, allowed: str) -> np.ndarray:
     try:
-        values = np.asarray(given)
+        values = np.asarray(array)
     except (TypeError, ValueError, RuntimeError) as error:  # ragged lists, tensors on a GPU
         raise InputError(f"{what} cannot be read as an array "
                          f"({str(error).splitlines()[0]}); allowed: {allowed}") from None
     if values.dtype.kind not in "fiu":
-        kind = f" of {values.dtype.name}" if isinstance(given, np.ndarray) else ""
-        raise InputError(f"{what} is {type(given).__name__}{kind}; allowed: {allowed}")
+        kind = f" of {values.dtype.name}" if isinstance(array, np.ndarray) else ""
+        raise InputError(f"{what} is {type(array).__name__}{kind}; allowed: {allowed}")
     return values
 
 
@@ -226,11 +226,11 @@ class Detections:
         Raises:
             InputError: wrong shape, or an unknown name.
         """
-        given = _numbers(boxes, "boxes", "numbers (K, 7) [x y z l w h yaw]")
-        if given.ndim > 2 or (given.size and given.shape[-1:] != (7,)):
-            raise InputError(f"boxes have shape {given.shape}; allowed is (K, 7) "
+        rows = _to_numbers(boxes, "boxes", "numbers (K, 7) [x y z l w h yaw]")
+        if rows.ndim > 2 or (rows.size and rows.shape[-1:] != (7,)):
+            raise InputError(f"boxes have shape {rows.shape}; allowed is (K, 7) "
                              "[x y z l w h yaw]")
-        boxes = np.ascontiguousarray(given, np.float32).reshape(-1, 7)
+        boxes = np.ascontiguousarray(rows, np.float32).reshape(-1, 7)
         count, columns = len(boxes), []
         for name, column in (("class_ids", _to_class_ids(class_ids)),
                              ("scores", np.asarray(scores, np.float32))):
@@ -264,10 +264,10 @@ class Detections:
                           np.concatenate([self.scores, others.scores]))
 
 
-def _to_class_ids(given: ArrayLike) -> np.ndarray:
-    values = np.asarray(given)
+def _to_class_ids(ids_or_names: ArrayLike) -> np.ndarray:
+    values = np.asarray(ids_or_names)
     if values.dtype.kind != "U":
-        return np.asarray(given, np.int32)
+        return np.asarray(ids_or_names, np.int32)
     for name in values.flat:
         if class_name(name) not in CLASSES:
             raise unknown_name("class", name, CLASSES)

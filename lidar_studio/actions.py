@@ -1,8 +1,8 @@
 """Actions of a labelling session: apply(state, action, motion) returns the next state.
 
 An action is a dict like a line of the journal. It contains all computed values, so a journal can be
-replayed without a detector. Its tracks are Track objects; decode_action() and encode_action()
-convert from and to a line of the journal.
+replayed without a detector. Its tracks are Track objects; convert_tracks() converts from and to a
+line of the journal.
 """
 
 from __future__ import annotations
@@ -26,8 +26,6 @@ from lidar_studio.state import (
     Stack,
     State,
     Track,
-    track_from_json,
-    track_to_json,
 )
 
 Action = Mapping[str, Any]
@@ -36,17 +34,8 @@ MAX_CLASS_LENGTH = 100                  # characters
 WITH_TRACKS = "seed", "propose", "import"  # actions with tracks; `tracks` of merge are ids
 
 
-def decode_action(line: Action) -> Action:
-    """Convert a line of the journal to an action."""
-    return _convert_tracks(line, track_from_json)
-
-
-def encode_action(action: Action, encode: Callable[[Track], Any] = track_to_json) -> Action:
-    """Convert an action to a line of the journal. encode: makes the JSON object of a track."""
-    return _convert_tracks(action, encode)
-
-
-def _convert_tracks(action: Action, convert: Callable[[Any], Any]) -> Action:
+def convert_tracks(action: Action, convert: Callable[[Any], Any]) -> Action:
+    """Return an action, or a line of the journal, with converted tracks."""
     if action.get("do") not in WITH_TRACKS or "tracks" not in action:
         return action
     return {**action, "tracks": [convert(track) for track in action["tracks"]]}
@@ -229,7 +218,7 @@ def _interpolate(state: State, action: Action, motion: Motion) -> Outcome:
     removed = track.removed_frames - {frame}
     boxes = reinterpolate_frame(track.boxes, removed, frame, motion)
     if boxes is None:
-        raise InputError(f"track {track.id} has no key box on both sides of frame {frame}")
+        raise InputError(f"track {track.id} has no key box on pair sides of frame {frame}")
     return _replace(state, replace(track, boxes=boxes, removed_frames=removed))
 
 
@@ -240,7 +229,7 @@ def _drop_seeds(seeds: Seeds, track: int) -> Seeds:
 def _copy(state: State, action: Action, motion: Motion) -> Outcome:
     track = require_track(state, action.get("track"))
     frm, to = require_frame(action, motion, "from"), require_frame(action, motion, "to")
-    box = motion.carry_box(require_box(track, frm).values, frm, to)
+    box = motion.to_sensor(motion.to_fixed(require_box(track, frm).values, frm), to)
     return _box(state, {"track": track.id, "frame": to, "box": box.tolist()}, motion)
 
 
@@ -277,10 +266,10 @@ def _reopen(state: State, action: Action, motion: Motion) -> Outcome:
 
 
 def _merge(state: State, action: Action, motion: Motion) -> Outcome:
-    both = action.get("tracks")
-    if not isinstance(both, list | tuple) or len(both) != 2 or both[0] == both[1]:
+    pair = action.get("tracks")
+    if not isinstance(pair, list | tuple) or len(pair) != 2 or pair[0] == pair[1]:
         raise InputError("merging needs two different tracks; select a second one")
-    first, second = (require_track(state, number) for number in both)
+    first, second = (require_track(state, number) for number in pair)
     boxes = {**second.boxes, **first.boxes}
     boxes |= {f: b for f, b in second.boxes.items()
               if b.kind == KEY and boxes[f].kind != KEY}

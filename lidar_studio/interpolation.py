@@ -48,10 +48,6 @@ class Motion:
         return box if self.poses is None else transform_boxes(
             box, invert_pose(self.poses[frame]))[0]
 
-    def carry_box(self, values: Array | tuple[float, ...], frm: int, to: int) -> Array:
-        """Move a box (7,) of a stationary object from one frame to another."""
-        return self.to_sensor(self.to_fixed(values, frm), to)
-
 
 def interpolate_box(first: Array, last: Array, share: float) -> Array:
     """Interpolate two boxes (7,) linearly, the yaw over the shorter turn."""

@@ -131,8 +131,8 @@ def _find_people(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> tuple[
     boxes = np.array([complete_box(b, find_usual_size(CLASSES[PEDESTRIAN]))
                       for b in survey.boxes[chosen].astype(np.float64)]).reshape(-1, 7)
     new = centre_distances(boxes, people).min(axis=1, initial=np.inf) > SAME_OBJECT_DISTANCE_M
-    both = found.followed_by(Detections.of(boxes[new], PEDESTRIAN, scores[chosen][new]))
-    return both, np.arange(len(both)) >= len(found)
+    objects = found.followed_by(Detections.of(boxes[new], PEDESTRIAN, scores[chosen][new]))
+    return objects, np.arange(len(objects)) >= len(found)
 
 
 def _add_similar_objects(survey: FrameSurvey, request: ProposalRequest, found: Detections,
@@ -148,12 +148,12 @@ def _add_similar_objects(survey: FrameSurvey, request: ProposalRequest, found: D
     shapes = survey.shapes[chosen].astype(np.float64)
     boxes = np.array([complete_box(b, sizes[best[k]].size)
                       for k, b in zip(chosen, shapes)]).reshape(-1, 7)
-    apart = np.maximum(SAME_OBJECT_DISTANCE_M, boxes[:, None, 3] / 3)
-    new = (centre_distances(boxes, found.boxes) > apart).all(axis=1)
+    min_distances = np.maximum(SAME_OBJECT_DISTANCE_M, boxes[:, None, 3] / 3)
+    new = (centre_distances(boxes, found.boxes) > min_distances).all(axis=1)
     classes = np.array([CLASSES.index(sizes[k].class_name) for k in best[chosen]], np.int32)
-    both = found.followed_by(Detections.of(boxes[new], classes[new],
+    objects = found.followed_by(Detections.of(boxes[new], classes[new],
                                            scores.max(axis=0)[chosen][new]))
-    return both, np.append(candidates, np.ones(int(new.sum()), bool))
+    return objects, np.append(candidates, np.ones(int(new.sum()), bool))
 
 
 NOT_VEHICLE_IDS = [i for i, kind in enumerate(KIND_OF_CLASS) if kind != KIND_OF_CLASS[0]]

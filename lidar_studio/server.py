@@ -103,11 +103,11 @@ class Server:
     async def check_request(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse requests from elsewhere, and convert exceptions to one-line errors."""
         host = (request.host or "").rsplit(":", 1)[0]
-        given = request.query.get("token") or request.cookies.get(_cookie_name(request)) or ""
+        token = request.query.get("token") or request.cookies.get(_cookie_name(request)) or ""
         origin = request.headers.get("Origin")
         if host not in HOSTS or (origin is not None and origin != f"http://{request.host}"):
             return web.Response(status=403, text="this page is only available on this machine\n")
-        if not hmac.compare_digest(given.encode(), self.content.token.encode()):
+        if not hmac.compare_digest(token.encode(), self.content.token.encode()):
             return web.Response(status=403, text="the token is wrong or missing; open the address "
                                                  "that lidar-perception printed\n")
         try:

@@ -21,8 +21,7 @@ from lidar_studio.actions import (
     Action,
     add_seed,
     apply,
-    decode_action,
-    encode_action,
+    convert_tracks,
     require_box,
     require_class_name,
     require_frame,
@@ -47,6 +46,7 @@ from lidar_studio.state import (
     State,
     Track,
     count_progress,
+    track_from_json,
     track_to_json,
 )
 
@@ -80,7 +80,7 @@ class Session:
         self._task = ""  # the worker's task, "" once it has ended
         self._lock, self._exporting = threading.RLock(), threading.Lock()
         for line in journal.lines:
-            self.state, _ = apply(self.state, decode_action(line), drive.motion)
+            self.state, _ = apply(self.state, convert_tracks(line, track_from_json), drive.motion)
         journal.lines.clear()
 
     @property
@@ -334,7 +334,7 @@ class Session:
                 encoded[track.id] = track_to_json(track)
             return encoded[track.id]
         self.journal.append({"seq": after.seq, "time": datetime.now(UTC).isoformat(), "by": by,
-                             **encode_action(action, encode)})
+                             **convert_tracks(action, encode)})
         self.state = after
         self._notify_change(action, change, by, encode)
         return after.seq

@@ -84,10 +84,10 @@ def compute_row_step(msg: Any) -> int:
 
     Some drivers send a row_step of 0, or of the whole cloud, for rows without padding.
     """
-    row, given = msg.width * msg.point_step, msg.row_step
+    row, step = msg.width * msg.point_step, msg.row_step
     whole = msg.height * row
-    complete = given == whole <= len(msg.data) < (msg.height - 1) * whole + row
-    return int(row if msg.height <= 1 or given == 0 or complete else given)
+    is_whole_cloud = step == whole <= len(msg.data) < (msg.height - 1) * whole + row
+    return int(row if msg.height <= 1 or step == 0 or is_whole_cloud else step)
 
 
 def read_columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:

@@ -27,7 +27,7 @@ def set_version(root: Path, version: str) -> None:
         path.write_text(text)
 
 
-def dated_changelog(text: str, version: str, day: str) -> str:
+def date_changelog(text: str, version: str, day: str) -> str:
     """Move the unreleased changes of a changelog to a section of the version."""
     match = re.search(r"(?ms)^## Unreleased\n(.*?)(?=^## |\Z)", text)
     if match is None:
@@ -44,7 +44,7 @@ def main(version: str) -> None:
         raise SystemExit(f"{version} is not of the form X.Y.Z")
     changelog = ROOT / "CHANGELOG.md"
     day = datetime.now(UTC).date().isoformat()
-    text = dated_changelog(changelog.read_text(), version, day)
+    text = date_changelog(changelog.read_text(), version, day)
     if subprocess.check_output(["git", "status", "--porcelain"], cwd=ROOT, text=True):
         raise SystemExit("the checkout has changes; commit them first")
     set_version(ROOT, version)

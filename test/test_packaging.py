@@ -63,11 +63,11 @@ def test_release_moves_unreleased_changes_under_the_version():
     release = run_path(str(ROOT / "scripts/release.py"))
     text = ("# Changes\n\n## Unreleased\n\n### Added\n\n### Fixed\n\n- A bug.\n\n"
             "## 0.1.0\n\n- Old.\n")
-    dated = release["dated_changelog"](text, "0.2.0", "2026-12-01")
+    dated = release["date_changelog"](text, "0.2.0", "2026-12-01")
     assert dated == ("# Changes\n\n" + release["EMPTY"] + "## 0.2.0 - 2026-12-01\n\n### Fixed\n\n"
                      "- A bug.\n\n## 0.1.0\n\n- Old.\n")
     with pytest.raises(SystemExit, match="no unreleased change"):
-        release["dated_changelog"](text.replace("- A bug.\n", ""), "0.2.0", "2026-12-01")
+        release["date_changelog"](text.replace("- A bug.\n", ""), "0.2.0", "2026-12-01")
 
 
 def test_release_sets_the_version_in_both_files(tmp_path):

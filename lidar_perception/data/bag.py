@@ -339,15 +339,15 @@ class BagHandle:
     """
 
     def __init__(self, path: Path, warn: bool = True):
-        self.path, self.warn, self.here = path, warn, threading.local()
+        self.path, self.warn, self._local = path, warn, threading.local()
 
     def __reduce__(self) -> tuple[type[BagHandle], tuple[Path, bool]]:
         return BagHandle, (self.path, False)
 
     def bag(self) -> Bag:
         """Return the bag, opened by the first call in this thread."""
-        if getattr(self.here, "process", None) != os.getpid():  # a fork shares open files
-            self.here.bag, self.here.process = Bag(self.path, warn=self.warn), os.getpid()
+        if getattr(self._local, "process", None) != os.getpid():  # a fork shares open files
+            self._local.bag, self._local.process = Bag(self.path, warn=self.warn), os.getpid()
             self.warn = False
-        bag: Bag = self.here.bag
+        bag: Bag = self._local.bag
         return bag

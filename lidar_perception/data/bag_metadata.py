@@ -110,14 +110,14 @@ def complete_profile(qos: dict[str, Any]) -> dict[str, Any]:
     return {**qos, **_OTHER_POLICIES}
 
 
-def parse_profiles(given: Any) -> list[Qos]:
+def parse_profiles(profiles: Any) -> list[Qos]:
     """Return the profiles of a topic, given as YAML text or parsed; [] if they cannot be parsed.
 
     Only history, depth, reliability and durability are read. Writers represent durations in many
     ways (numbers, "infinite", left out), and nodes do not need them.
     """
     try:
-        profiles = yaml.safe_load(given) if isinstance(given, str) else given
+        profiles = yaml.safe_load(profiles) if isinstance(profiles, str) else profiles
         # rosbags requires all policies (rosbags/rosbag2/metadata.py, parse_qos).
         return parse_qos(cast(Any, [
             {**SENSOR_QOS, **{key: profile[key] for key in SENSOR_QOS

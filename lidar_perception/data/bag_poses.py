@@ -72,7 +72,7 @@ class BagPoses:
         if self.odometry:
             if self.frame_id == self._first.header.frame_id.lstrip("/"):  # clouds in a fixed frame
                 return np.tile(np.eye(4), (len(times), 1, 1))
-            return self._odometry_poses(times) @ self._sensor_in_odometry_child(times)
+            return self.odometry_poses(times) @ self._sensor_in_odometry_child(times)
         if not self.fixed:
             raise MissingTransform(f"{self.path} has neither odometry nor a TF in which "
                                    f"'{self.frame_id}' moves; record one of them")
@@ -154,11 +154,8 @@ class BagPoses:
                              "too") from None
         return replace(objects, boxes=transform_boxes(objects.boxes, pose))
 
-    def odometry_pose(self, stamp_ns: int) -> np.ndarray:
-        """Return the pose (4, 4) of the odometry; raise MissingTransform if it is unknown."""
-        return self._odometry_poses(np.array([stamp_ns]))[0]
-
-    def _odometry_poses(self, times: np.ndarray) -> np.ndarray:
+    def odometry_poses(self, times: np.ndarray) -> np.ndarray:
+        """Return the odometry's poses (M, 4, 4) at times (M,) ns. MissingTransform if unknown."""
         return self._odometry.lookup_many(FIXED, MOVING, times, MAX_POSE_GAP_S)
 
     def _sensor_in_odometry_child(self, times: np.ndarray) -> np.ndarray:

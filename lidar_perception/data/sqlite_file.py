@@ -24,7 +24,8 @@ class SqliteFile:
         # rosbags opens all files as immutable and so misses messages that are only in the -wal
         # file (rosbags/rosbag2/storage_sqlite3.py, Sqlite3Reader.open). In exclusive mode SQLite
         # reads that file without a -shm file; without locks this works in read-only folders.
-        has_log = any(_file_size(path.with_name(path.name + end)) for end in ("-wal", "-journal"))
+        logs = (path.with_name(path.name + end) for end in ("-wal", "-journal"))
+        has_log = any(log.is_file() and log.stat().st_size for log in logs)
         options = "mode=ro&vfs=unix-none" if has_log else "immutable=1"
         self.database = sqlite3.connect(f"{path.absolute().as_uri()}?{options}", uri=True,
                                         check_same_thread=False)
@@ -66,7 +67,3 @@ class SqliteFile:
         with_messages = [spans[topic.id] for topic in self.topics if topic.id in spans]
         self.times = (min(first for _, first, _ in with_messages),
                       max(last for *_, last in with_messages)) if with_messages else None
-
-
-def _file_size(path: Path) -> int:
-    return path.stat().st_size if path.is_file() else 0

@@ -153,7 +153,7 @@ def to_ground_truth(labels: FrameLabels) -> GroundTruth:
 
 
 def get_id_and_score(labels: FrameLabels, k: int) -> dict[str, Any]:
-    """Return track_id and score of box k, as far as it has them."""
+    """Return the track_id and score of box k, without missing ones."""
     fields: dict[str, Any] = {}
     if labels.track_ids[k] != NO_TRACK:
         fields["track_id"] = int(labels.track_ids[k])

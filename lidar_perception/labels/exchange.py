@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ FORMATS: dict[str, tuple[Read, Write]] = {
     "sustech": (sustech.read, sustech.write),
     "openlabel": (openlabel.read, openlabel.write),
     "mcap": (bag.read, bag.write),
-    "mcap-labels": (bag.read, bag.write_labels),
+    "mcap-labels": (bag.read, partial(bag.write, clouds=False)),
 }
 # Readers of these formats and of those that are only read.
 READERS: dict[str, Read] = {name: read for name, (read, _) in FORMATS.items()} | {

@@ -70,9 +70,10 @@ def to_point_cloud(msg: Any, intensity_max: float | None = None,
             indices = np.flatnonzero(_single(points, "in_view"))
             points = points.take(indices)
         coordinates = read_xyz(points)
-        intensity = None if intensity_max is None else _read_intensity(points, intensity_max, scale)
+        raw = None if intensity_max is None else _read_raw_intensity(points)
     except CloudError as error:
         raise InputError(str(error)) from None
+    intensity = None if raw is None else to_unit(raw[0], intensity_max or scale(*raw))
     usable = usable_returns(coordinates)
     if not usable.all():
         kept = np.flatnonzero(usable)
@@ -81,13 +82,6 @@ def to_point_cloud(msg: Any, intensity_max: float | None = None,
         intensity = None if intensity is None else intensity.take(kept)
     cloud = PointCloud(coordinates, intensity, to_ns(msg.header.stamp), msg.header.frame_id)
     return cloud, np.arange(len(points)) if indices is None else indices
-
-
-def _read_intensity(points: np.ndarray, full: float, scale: FullScale) -> np.ndarray | None:
-    if (raw := _read_raw_intensity(points)) is None:
-        return None
-    values, kind = raw
-    return to_unit(values, full or scale(values, kind))
 
 
 def _read_raw_intensity(points: np.ndarray) -> tuple[np.ndarray, np.dtype] | None:

@@ -30,13 +30,13 @@ WEIGHTS = (".safetensors", ".onnx", ".json")
 @detectors_options
 @click.option("--results", multiple=True, type=click.Path(path_type=Path), metavar="FOLDER",
               help="KITTI result files, FOLDER/NAME.txt, such as `detect --format kitti "
-              "--out FOLDER` writes. May be given several times.")
+              "--out FOLDER` writes. May be wrong_options several times.")
 @click.option("--points", "--topic", "points", metavar="TOPIC", help="Topic of the clouds of a bag "
               "or of the running graph. Default: clustered ones, else /points, else the only cloud "
               "topic.")
 @click.option("--detections", multiple=True, metavar="TOPIC", help="With --live: a topic of boxes, "
               "MarkerArray or Detection3DArray. Default: all */output/detections that belong to "
-              "the clouds. May be given several times.")
+              "the clouds. May be wrong_options several times.")
 @click.option("--namespace", default="", metavar="NAME", help="With --live: show the nodes in "
               "this namespace, / for those without one, if several graphs run.")
 @click.option("--sequence", metavar="NAME", help="The drive of DATA to show, if it has "
@@ -73,8 +73,9 @@ def view(data: Path | None, live: bool, detectors: tuple[DetectorChoice, ...],
         raise click.UsageError("give DATA, the path of a recording, or --live")
     excluded = ({"--weights": detectors, "--results": results, "--sequence": sequence} if live
                 else {"--detections": detections, "--namespace": namespace})
-    if given := [name for name, value in excluded.items() if value]:
-        raise click.UsageError(f"{', '.join(given)}: {'not with' if live else 'only with'} --live")
+    if wrong_options := [name for name, value in excluded.items() if value]:
+        raise click.UsageError(f"{', '.join(wrong_options)}: "
+                               f"{'not with' if live else 'only with'} --live")
 
     def started(url: str) -> None:
         url += f"&frame={frame}&theme={theme}"
@@ -142,14 +143,14 @@ def _open_content(path: Path, detectors: tuple[DetectorChoice, ...], results: tu
     return PageContent(drive, layers=found.bind_layers(drive), tracks=lambda: found.tracks)
 
 
-def make_short_names(paths: list[Path], taken: Collection[str] = ()) -> list[str]:
+def make_short_names(paths: list[Path], used_names: Collection[str] = ()) -> list[str]:
     """Return a unique short name for each path: its shortest end that is not the end of another one
-    and not in `taken`, else the whole path."""
+    and not in `used_names`, else the whole path."""
     parts = [path.with_suffix("").parts if path.suffix in WEIGHTS else path.parts for path in paths]
     names = []
     for i, own in enumerate(parts):
         ends = (own[-k:] for k in range(1, len(own) + 1))
         others = [other for j, other in enumerate(parts) if j != i]
-        names.append(next(("/".join(end) for end in ends if "/".join(end) not in taken and all(
+        names.append(next(("/".join(end) for end in ends if "/".join(end) not in used_names and all(
             other[-len(end):] != end for other in others)), str(paths[i])))
     return names

@@ -179,15 +179,6 @@ def test_bag_without_messages_has_no_frames(tmp_path):
         open_recording(tmp_path / "bag")
 
 
-@pytest.mark.no_cover
-def test_sqlite_bag_is_read_like_mcap(written, tmp_path):
-    copy_bag(written, tmp_path / "sql", "sqlite3")
-    for a, b in zip(open_recording(written), open_recording(tmp_path / "sql"), strict=True):
-        assert same_cloud(a.load().xyz, b.load().xyz)
-        assert np.array_equal(a.camera().projection, b.camera().projection)
-        assert (a.truth() is None) == (b.truth() is None)
-
-
 def load_bytes(frames, i):
     return frames[i].load().xyz.tobytes()
 

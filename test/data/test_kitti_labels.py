@@ -16,15 +16,7 @@ from kitti_samples import (
 )
 from samples import AXES, LABELS, LIDAR_TO_CAMERA, object_folder, write
 
-from lidar_perception.data.kitti.calibration import read_calibration
-from lidar_perception.data.kitti.labels import (
-    format_label,
-    parse_label,
-    read_object_labels,
-    read_tracking_labels,
-    to_ground_truth,
-    to_labels,
-)
+from lidar_perception.data.kitti.labels import parse_label, to_ground_truth, to_labels
 from lidar_perception.data.open import open_recording
 from lidar_perception.geometry import box_corners
 from lidar_perception.types import CLASSES, GroundTruth
@@ -124,40 +116,3 @@ def test_folder_without_labels_has_no_truth(tmp_path, layout):
     for path in [*root.rglob("label_*/*.txt"), *root.rglob("tracklet_labels.xml")]:
         path.unlink()
     assert [f.truth() for f in open_recording(root)] == [None] * len(open_recording(root))
-
-
-def test_real_object_labels_survive_conversion(data):
-    folder = data / "kitti_object/training"
-    paths = sorted(folder.glob("label_2/*.txt"))
-    assert paths
-    for path in paths:
-        to_camera = read_calibration(folder / "calib" / path.name).lidar_to_camera
-        truth = through_markers(read_object_labels(path, to_camera))
-        lines = [line for line in path.read_text().splitlines() if line]
-        assert sorted(format_label(x) for x in to_labels(truth, to_camera)) == sorted(lines), path
-
-
-def test_real_tracking_labels_survive_conversion(data):
-    folder = data / "kitti_tracking/training"
-    to_camera = read_calibration(folder / "calib/0000.txt").lidar_to_camera
-    path = folder / "label_02/0000.txt"
-    converted = [[frame, x["track_id"], x["class"], x["truncated"], x["occluded"], x["alpha"],
-                  *x["bbox"], *x["dimensions"], *x["location"], x["rotation_y"]]
-                 for frame, truth in read_tracking_labels(path, to_camera).items()
-                 for x in to_labels(through_markers(truth), to_camera)]
-    lines = [line.split() for line in path.read_text().splitlines()]
-    expected = [[int(f), int(t), name, *map(float, rest)] for f, t, name, *rest in lines]
-    assert sorted(converted, key=str) == sorted(
-        [[*row[:4], int(row[4]), *row[5:]] for row in expected], key=str)
-
-
-def test_real_labels_can_be_computed_from_their_boxes(data):
-    folder = data / "kitti_object/training"
-    for path in sorted(folder.glob("label_2/*.txt")):
-        to_camera = read_calibration(folder / "calib" / path.name).lidar_to_camera
-        truth = read_object_labels(path, to_camera)
-        for box, extra in zip(truth.boxes, truth.extras):
-            again, = to_labels(GroundTruth.of([box], [0]), to_camera)
-            for name in ("dimensions", "location"):
-                np.testing.assert_allclose(again[name], extra[name], atol=0.005)
-            assert abs(np.sin((again["rotation_y"] - extra["rotation_y"]) / 2)) < 0.0025, path

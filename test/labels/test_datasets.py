@@ -53,9 +53,9 @@ def same_frames(recording, others, boxes=1e-5, points=0.0):
         if labels is not None:
             assert np.array_equal(again.classes, labels.classes)
             assert np.array_equal(again.instances, labels.instances)
-        here, again = frame.pose(), other.pose()
-        if here is not None and again is not None:
-            np.testing.assert_allclose(again, here, atol=1e-6)
+        pose_before, again = frame.pose(), other.pose()
+        if pose_before is not None and again is not None:
+            np.testing.assert_allclose(again, pose_before, atol=1e-6)
         truth, again = frame.truth(), other.truth()
         assert (truth is None) == (again is None)
         if truth is not None:

@@ -65,7 +65,7 @@ def message(make, fields, data, *, height=1, width=1, point_step, row_step=None,
 
 
 def two_fields(make, *, names="ab", datatypes=(7, 7), count=1, **shape):
-    """Three points of two float32, or what is said otherwise."""
+    """Make a cloud of three points with two float32 fields; `shape` changes its layout."""
     fields = [field(make, names[0], 0, datatypes[0]), field(make, names[1], 4, datatypes[1], count)]
     return message(make, fields, np.zeros(24, np.uint8), **dict(width=3, point_step=8) | shape)
 
@@ -75,7 +75,7 @@ def is_big(dtype: np.dtype) -> bool:
 
 
 def padded(make, cloud: np.ndarray, height: int, pad: int, unnamed=()):
-    """An organised cloud with pad bytes of 0xAA after each row."""
+    """Make an organised cloud with `pad` bytes of 0xAA after each row."""
     rows = np.frombuffer(cloud.tobytes(), np.uint8).reshape(height, -1)
     data = np.pad(rows, [(0, 0), (0, pad)], constant_values=0xAA)
     fields = [*make_point_fields(cloud.dtype, make), *(field(make, "", at, 2) for at in unnamed)]
@@ -85,12 +85,12 @@ def padded(make, cloud: np.ndarray, height: int, pad: int, unnamed=()):
 
 
 def stacked(cloud: np.ndarray, times: int) -> np.ndarray:
-    """The cloud several times; np.concatenate would lose the bytes between fields."""
+    """Repeat a cloud, including the bytes between fields, which np.concatenate drops."""
     return np.ndarray(len(cloud) * times, cloud.dtype, cloud.tobytes() * times)
 
 
 def same(a: np.ndarray, b: np.ndarray) -> bool:
-    """Equal bit by bit in every field; what lies between fields does not count."""
+    """Return True if all fields are equal bit by bit, ignoring padding."""
     return len(a) == len(b) and a.dtype.names == b.dtype.names and all(
         a[n].dtype == b[n].dtype and a[n].tobytes() == b[n].tobytes() for n in a.dtype.names)
 

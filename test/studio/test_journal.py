@@ -138,8 +138,8 @@ with open_journal(Path(sys.argv[1]), make_journal_header("drive", ["a", "b c"], 
 def test_full_disk_is_reported_and_writing_continues_later(tmp_path):
     result = subprocess.run([sys.executable, "-c", FULL, str(tmp_path)], text=True, check=True,
                             capture_output=True)
-    done, _, said = result.stdout.partition(" ")
-    assert "nothing was done" in said and int(done) > 3
+    done, _, message_text = result.stdout.partition(" ")
+    assert "nothing was done" in message_text and int(done) > 3
     with open_journal(tmp_path, HEAD) as journal:
         assert len(journal.lines) == int(done) + 1 and journal.message is None
         assert journal.lines[-1]["do"] == "redo"

@@ -40,15 +40,15 @@ def drive(name="monday", x=5.0):
     return Drive(name, Recording(Path(name), "made up", frames(x)))
 
 
-def labelled(made, frame=0, **more):
-    made.do({"do": "add", "frame": frame, "box": BOX, "class": "Pedestrian", **more})
+def labelled(session, frame=0, **more):
+    session.do({"do": "add", "frame": frame, "box": BOX, "class": "Pedestrian", **more})
 
 
 def test_journal_is_identified_by_clouds_not_by_folder_name(tmp_path):
-    with open_session(drive(), tmp_path) as made:
-        labelled(made)
-    with open_session(drive("renamed"), tmp_path) as made:
-        assert len(made.state.tracks) == 1
+    with open_session(drive(), tmp_path) as session:
+        labelled(session)
+    with open_session(drive("renamed"), tmp_path) as session:
+        assert len(session.state.tracks) == 1
     with pytest.raises(InputError, match="another drive"), open_session(drive(x=6.0), tmp_path):
         pass
 
@@ -58,8 +58,8 @@ def test_old_journal_is_identified_by_the_drive_name(tmp_path):
                               [f.stamp_ns for f in frames()], "")
     del old["clouds"]
     Journal(tmp_path, old).close()
-    with open_session(drive(), tmp_path) as made:
-        labelled(made)
+    with open_session(drive(), tmp_path) as session:
+        labelled(session)
     with pytest.raises(InputError, match="another drive"), open_session(drive("other"), tmp_path):
         pass
 
@@ -79,22 +79,23 @@ def test_journal_that_grew_meanwhile_is_not_overwritten(tmp_path, monkeypatch):
 
 
 def test_labels_are_imported_once_and_added_to_existing_ones(tmp_path):
-    with open_session(drive(), tmp_path / "one") as made:
-        labelled(made)
-        made.export("openlabel", "labels.json")
-        made.do({"do": "class", "track": 1, "class": "Cyclist"})
-        made.export("openlabel", "others.json")
-    with open_session(drive(), tmp_path / "two") as made:
+    with open_session(drive(), tmp_path / "one") as session:
+        labelled(session)
+        session.export("openlabel", "labels.json")
+        session.do({"do": "class", "track": 1, "class": "Cyclist"})
+        session.export("openlabel", "others.json")
+    with open_session(drive(), tmp_path / "two") as session:
         for name in ("labels", "others"):
-            asked = {"do": "import", "path": str(tmp_path / f"one/{name}.json")}
-            made.do(asked)
+            import_action = {"do": "import", "path": str(tmp_path / f"one/{name}.json")}
+            session.do(import_action)
             with pytest.raises(AlreadyImportedError):
-                made.do(asked)
-        made.do({"do": "undo"})
-        made.do(asked)  # an undone import can be repeated
-        assert sorted(t.class_name for t in made.state.tracks.values()) == ["Cyclist", "Pedestrian"]
-    with open_session(drive(), tmp_path / "two") as made, pytest.raises(AlreadyImportedError):
-        made.do(asked)
+                session.do(import_action)
+        session.do({"do": "undo"})
+        session.do(import_action)  # an undone import can be repeated
+        names = sorted(track.class_name for track in session.state.tracks.values())
+        assert names == ["Cyclist", "Pedestrian"]
+    with open_session(drive(), tmp_path / "two") as session, pytest.raises(AlreadyImportedError):
+        session.do(import_action)
 
 
 def test_extras_of_all_imports_are_kept():
@@ -106,28 +107,29 @@ def test_extras_of_all_imports_are_kept():
 
 
 def test_merged_boxes_without_ids_get_one(tmp_path):
-    with open_session(drive(), tmp_path / "one") as made:
+    with open_session(drive(), tmp_path / "one") as session:
         for frame in range(COUNT):
-            labelled(made, frame)
-        made.export("sustech", "boxes")
+            labelled(session, frame)
+        session.export("sustech", "boxes")
         for file in (tmp_path / "one/boxes").rglob("*.json"):
             file.write_text(file.read_text().replace("obj_id", "nobody"))
-    with open_session(drive(), tmp_path / "two") as made:
-        made.do({"do": "import", "path": str(tmp_path / "one/boxes")})
-        first, *others = sorted(made.state.tracks)
+    with open_session(drive(), tmp_path / "two") as session:
+        session.do({"do": "import", "path": str(tmp_path / "one/boxes")})
+        first, *others = sorted(session.state.tracks)
         for other in others:
-            made.do({"do": "merge", "tracks": [first, other]})
-        ids = {int(i) for f in to_labels(made.state, made.drive.frames).frames for i in f.track_ids}
+            session.do({"do": "merge", "tracks": [first, other]})
+        labels = to_labels(session.state, session.drive.frames)
+        ids = {int(i) for frame in labels.frames for i in frame.track_ids}
         assert len(ids) == 1 and min(ids) >= 0
 
 
 def test_concurrent_exports_are_complete(tmp_path):
-    with open_session(drive(), tmp_path) as made:
+    with open_session(drive(), tmp_path) as session:
         for frame in range(COUNT):
-            labelled(made, frame)
+            labelled(session, frame)
 
         def export(_):
-            return made.export("labelcloud", "labels", force=True)["boxes"]
+            return session.export("labelcloud", "labels", force=True)["boxes"]
 
         with ThreadPoolExecutor(4) as pool:
             assert list(pool.map(export, range(12))) == [COUNT] * 12
@@ -140,21 +142,21 @@ def test_journal_is_refused_if_poses_appear_or_disappear(tmp_path):
     bare, posed = drive(), Drive("monday", Recording(Path("monday"), "made up", [
         replace(frame, pose=lambda: np.eye(4)) for frame in frames()]))
     for k, (now, then) in enumerate(((bare, posed), (posed, bare))):
-        with open_session(now, tmp_path / str(k)) as made:
-            labelled(made)
+        with open_session(now, tmp_path / str(k)) as session:
+            labelled(session)
         with pytest.raises(InputError, match="poses"), open_session(then, tmp_path / str(k)):
             pass
-        with open_session(now, tmp_path / str(k)) as made:
-            assert len(made.state.tracks) == 1
+        with open_session(now, tmp_path / str(k)) as session:
+            assert len(session.state.tracks) == 1
 
 
 @pytest.mark.parametrize("name", ["journal.jsonl", "./other/journal.jsonl"])
 def test_export_does_not_overwrite_the_journal(tmp_path, name):
-    with open_session(drive(), tmp_path) as made:
-        labelled(made)
+    with open_session(drive(), tmp_path) as session:
+        labelled(session)
         (tmp_path / "other").symlink_to(tmp_path)
         with pytest.raises(InputError, match="is the journal"):
-            made.export("nuscenes-detection", name, force=True)
+            session.export("nuscenes-detection", name, force=True)
 
 
 def test_nan_is_null_in_the_journal():
@@ -177,8 +179,8 @@ def test_command_imports_once_and_needs_a_journal_to_export(tmp_path):
     nowhere = run("--out", tmp_path / "empty", *to)
     assert isinstance(nowhere.exception, InputError) and "no journal" in str(nowhere.exception)
     assert not (tmp_path / "empty").exists()
-    with open_session(select_drive(open_recording(tmp_path / "bag")), tmp_path / "made") as made:
-        labelled(made)
+    with open_session(select_drive(open_recording(tmp_path / "bag")), tmp_path / "made") as session:
+        labelled(session)
     assert run("--out", tmp_path / "made", *to).exit_code == 0
     for _ in range(2):
         again = run("--out", tmp_path / "two", "--import", f"openlabel:{tmp_path / 'labels.json'}",

@@ -47,28 +47,28 @@ def boxes(stamp, frame_id="velodyne", x=5.0, ids=(3,)):
 def live():
     made = LiveGraph("test", max_frames=5)
     made.expect_topic(FOUND, BOXES)
-    made.told = []
-    made.listeners.append(made.told.append)
+    made.events = []
+    made.listeners.append(made.events.append)
     return made
 
 
-def frames_told(live):
-    return [event["live"]["frame"] for event in live.told if "live" in event]
+def list_shown_frames(live):
+    return [event["live"]["frame"] for event in live.events if "live" in event]
 
 
 def test_frame_waits_for_its_boxes_and_late_ones_are_counted(live, monkeypatch):
     live.add_cloud(cloud(10))
     live.add_boxes(FOUND, boxes(10), None)       # the first: from now on clouds wait for this topic
     live.add_cloud(cloud(20))
-    assert frames_told(live)[-1] == 0
+    assert list_shown_frames(live)[-1] == 0
     live.add_boxes(FOUND, boxes(20), None)
-    assert frames_told(live)[-1] == 1
+    assert list_shown_frames(live)[-1] == 1
     live.add_cloud(cloud(30))
     monkeypatch.setattr(live_graph, "MAX_WAIT_S", 0.0)
     live.update()
-    assert frames_told(live)[-1] == 2 and live.layers(2, 0.0)["detections"] == {}
+    assert list_shown_frames(live)[-1] == 2 and live.layers(2, 0.0)["detections"] == {}
     live.add_boxes(FOUND, boxes(30), None)
-    assert frames_told(live)[-2:] == [2, 2]
+    assert list_shown_frames(live)[-2:] == [2, 2]
     row, = live.layers(2, 0.0)["detections"]["fused_detector"]
     assert row[:9] == [5, 0, 0, 1, 1, 1, 0, "Car", 0.5] and row[9] == {"pillars": 0.25}
     assert [t["late"] for t in live.get_status()["topics"]] == [1]
@@ -119,7 +119,7 @@ def test_looping_bag_is_shown_again(live):
     for stamp in (1, 2, 1, 2):
         live.add_cloud(cloud(stamp))
         live.add_boxes(FOUND, boxes(stamp), None)
-    assert frames_told(live) == [0, 0, 1, 2, 3]  # that of the first boxes again
+    assert list_shown_frames(live) == [0, 0, 1, 2, 3]  # that of the first boxes again
     assert all(live.layers(i, 0.0)["detections"] for i in range(4))
 
 
@@ -163,10 +163,11 @@ def test_boxes_in_another_frame_are_transformed_once_tf_arrives(live, monkeypatc
         live.add_boxes(TRACKED, from_marker_array(tracks), tracks)
         if i:
             live.add_boxes(FOUND, boxes(stamp), None)
-    assert frames_told(live)[-1] == 0 and live.get_status()["lines"] == []  # the other waits for TF
+    assert list_shown_frames(live)[-1] == 0  # the other one waits for TF
+    assert live.get_status()["lines"] == []
     live.tree.set("odom", "base", 11 * second, [4, 0, 0], [0, 0, 0, 1])
     live.update()
-    assert frames_told(live)[-1] == 1
+    assert list_shown_frames(live)[-1] == 1
     track, = live.list_tracks()
     for row, frame in zip(track["boxes"], (0, 1), strict=True):
         np.testing.assert_allclose(row[1:8], boxes(0).boxes[0], atol=1e-6)
@@ -176,7 +177,7 @@ def test_boxes_in_another_frame_are_transformed_once_tf_arrives(live, monkeypatc
     live.add_boxes(TRACKED, boxes(11 * second + second // 2, "odom"), None)
     assert any("the newest transform" in line for line in live.get_status()["lines"])
     live.add_boxes(FOUND, boxes(11 * second + second // 2), None)
-    assert frames_told(live)[-1] == 2  # shown without
+    assert list_shown_frames(live)[-1] == 2  # shown without
 
 
 def test_two_trackers_have_distinct_ids_and_misses_are_known(live):
@@ -216,9 +217,9 @@ def test_cloud_with_most_columns_and_its_boxes_are_selected():
     assert select_cloud_topic(two, "front", "points") == "/front/points"
     assert select_cloud_topic({"/velodyne_points": CLOUD, "/x": MARKERS}) == "/velodyne_points"
     for types, wanted in (({}, ""), (one, "/no"), ({"/a": CLOUD, "/b": CLOUD}, "")):
-        with pytest.raises(InputError) as said:
+        with pytest.raises(InputError) as error_info:
             select_cloud_topic(types, wanted=wanted)
-        assert "\n" not in str(said.value)
+        assert "\n" not in str(error_info.value)
 
 
 def test_boxes_of_another_robot_are_not_selected():

@@ -69,8 +69,8 @@ def test_trimmed_click_is_not_tracked_beyond_the_cut():
 
 
 def test_two_clicks_in_one_frame_are_both_found():
-    look = FrameSurvey(Detections.none(), np.zeros((0, 7)), np.zeros((0, 80), np.uint32), {},
+    survey = FrameSurvey(Detections.none(), np.zeros((0, 7)), np.zeros((0, 80), np.uint32), {},
                        np.zeros((0, 7)))
     both = [(np.array([x, 0.0, -1, 0.8, 0.6, 1.7, 0]), "Pedestrian") for x in (5.0, 9.0)]
-    found, _ = find_objects(look, ProposalRequest(), both)
+    found, _ = find_objects(survey, ProposalRequest(), both)
     assert found.boxes[:, 0].tolist() == [5.0, 9.0]

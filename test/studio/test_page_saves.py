@@ -122,17 +122,17 @@ def test_late_state_reverts_nothing(browser, page, labels, person):
 
 
 def test_browser_confirms_leaving_with_unsaved_actions(browser, labels):
-    held, asked = [], []
+    held, requests = [], []
     with opened(browser, labels.url) as other:
         other.route("**/api/do*", lambda route: held.append(route))
-        other.on("dialog", lambda dialog: (asked.append(dialog.type), dialog.dismiss()))
+        other.on("dialog", lambda dialog: (requests.append(dialog.type), dialog.dismiss()))
         other.keyboard.press("k")
         while not held:
             other.wait_for_timeout(10)
         other.close(run_before_unload=True)
         held.pop().continue_()
         other.wait_for_function("() => page.store.checked.size === 1 && page.store.frame === 1")
-        assert asked == ["beforeunload"]
+        assert requests == ["beforeunload"]
         other.unroute("**/api/do*")
         other.keyboard.press("Control+z")
         other.wait_for_function("() => page.store.checked.size === 0")

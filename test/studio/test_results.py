@@ -117,9 +117,9 @@ def test_tracks_of_different_trackers_have_distinct_ids(trackers, far):
     trackers[1] = [*{*trackers[1], *(n + far for n in trackers[0] if n + far < 2**31)}]
     made = [[t["id"] for t in tracks_to_json({0: marked(numbers)}, "/a/output/tracks", k)]
             for k, numbers in enumerate(trackers)]
-    every = [number for each in made for number in each]
-    assert len(set(every)) == len(every) == sum(map(len, trackers))
-    assert all(0 <= number < 2**53 for number in every)  # what a page can count
+    all_ids = [number for each in made for number in each]
+    assert len(set(all_ids)) == len(all_ids) == sum(map(len, trackers))
+    assert all(0 <= number < 2**53 for number in all_ids)  # what a page can count
     assert set(made[0]) >= {n for n in trackers[0] if n >= 0}
 
 
@@ -173,6 +173,6 @@ def test_file_without_a_cloud_is_refused_before_serving(verb, content, tmp_path,
     file.write_bytes(content)
     monkeypatch.chdir(tmp_path)
     assert exit_of(monkeypatch, verb, file, "--no-open") == 2
-    said = capsys.readouterr()
-    assert str(file) in said.err.splitlines()[-1] and "http" not in said.out
+    output = capsys.readouterr()
+    assert str(file) in output.err.splitlines()[-1] and "http" not in output.out
     assert not (tmp_path / "out").exists()

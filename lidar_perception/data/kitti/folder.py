@@ -72,17 +72,13 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
         raise InputError(f"{path} has no KITTI scans: expected training/velodyne/*.bin (object) or "
                          "training/velodyne/0000/*.bin (tracking)")
     labelled = (folder / "label_02").is_dir() or (folder / "label_2").is_dir()
-    missing = (_find_missing_tracking_scans(folder, frames) if tracking
-               else _find_missing_object_scans(folder))
+    missing = _find_missing_tracking_scans(folder, frames) if tracking else [
+        (label.stem, str(label)) for label in sorted(folder.glob("label_2/*.txt"))
+        if not any((folder / name / f"{label.stem}.bin").exists() for name in SCANS)]
     return Recording(path, f"KITTI {'tracking data' if tracking else OBJECT_DATA}", frames,
                      frozenset({CAMERA} | ({BOXES} if labelled else set())),
                      tuple((name, f"{label} has no scan; download it again")
                            for name, label in missing) if scans else (), is_sequential=tracking)
-
-
-def _find_missing_object_scans(folder: Path) -> list[tuple[str, str]]:
-    return [(label.stem, str(label)) for label in sorted(folder.glob("label_2/*.txt"))
-            if not any((folder / name / f"{label.stem}.bin").exists() for name in SCANS)]
 
 
 def _find_missing_tracking_scans(folder: Path, frames: list[Frame]) -> list[tuple[str, str]]:

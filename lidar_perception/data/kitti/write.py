@@ -20,7 +20,7 @@ from lidar_perception.types import GroundTruth
 
 MIN_DEPTH_M = 0.1  # from the camera, of points in the image
 MIN_PIXELS = 2     # width and height of the smallest 2D box
-TRACKING_NAME_BY_NAME = {ours: theirs for theirs, ours in NAME_BY_TRACKING_NAME.items()}
+TRACKING_NAME_BY_NAME = {name: alias for alias, name in NAME_BY_TRACKING_NAME.items()}
 
 # The twelve edges of box_corners: bottom, top, vertical.
 EDGES = np.array([(i + up, (i + 1) % 4 + up) for up in (0, 4) for i in range(4)]

@@ -182,7 +182,8 @@ def _compute_velocities(centres: np.ndarray, seconds: np.ndarray,
                         neighbours: np.ndarray) -> np.ndarray:
     """Compute velocities (K, 2) m/s from the previous to the next label of the same object.
 
-    A missing one is replaced by the label itself. NaN if both are missing or too far apart in time.
+    A missing label is replaced by the label itself. NaN without neighbours, or if they are too far
+    away in time.
     """
     own = np.arange(len(centres))
     first, last = (np.where(rows >= 0, rows, own) for rows in neighbours.T)

@@ -75,13 +75,7 @@ def _make_frame_labels(frame: Frame, objects: MarkedObjects | None, markers: boo
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False,
           clouds: bool = True) -> None:
-    """Write a bag with the labels, clouds, poses and camera of the frames to the folder `out`."""
+    """Write a bag with the labels, poses, camera and, optionally, clouds of the frames to `out`."""
     write_bag(out, (replace(frame, truth=partial(to_ground_truth, each))
                     for frame, each in zip(frames, labels.frames)),
               force=force, clouds=clouds, detections_3d=True)
-
-
-def write_labels(labels: DriveLabels, out: Path, frames: Sequence[Frame],
-                 force: bool = False) -> None:
-    """Write a bag with the labels, without clouds, to the folder `out`."""
-    write(labels, out, frames, force, clouds=False)

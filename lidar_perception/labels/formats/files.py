@@ -129,14 +129,14 @@ def collect_track_names(frames: Iterable[FrameLabels], key: str) -> dict[int, st
     Each name is used for one track only, so that parts of a split track have different names.
     """
     names: dict[int, str] = {}
-    taken = set()
+    used_names = set()
     for labels in frames:
         for track, extra in zip(labels.track_ids.tolist(), labels.extra):
             name = extra.get(key)
             if (track != NO_TRACK and track not in names and name is not None
-                    and str(name) not in taken):
+                    and str(name) not in used_names):
                 names[track] = str(name)
-                taken.add(str(name))
+                used_names.add(str(name))
     return names
 
 

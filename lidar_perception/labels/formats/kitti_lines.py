@@ -86,7 +86,9 @@ def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str
         calibration = require_calibration(frame)
         to_lidar = np.linalg.inv(calibration.lidar_to_camera)
         pixels, outside = project_boxes(labels.boxes, calibration)
-        occlusion = compute_occlusion_levels(pixels, _compute_depths(labels.boxes, calibration))
+        to_camera = calibration.lidar_to_camera
+        depths = labels.boxes[:, :3] @ to_camera[2, :3] + to_camera[2, 3]
+        occlusion = compute_occlusion_levels(pixels, depths)
     lines = []
     for k, (box, name, extra) in enumerate(zip(labels.boxes, labels.class_names, labels.extra)):
         line = {"class": "_".join(name.split()) or "Misc",
@@ -129,10 +131,6 @@ def _is_as_read(box: np.ndarray, extra: dict[str, Any], to_lidar: np.ndarray) ->
 def _is_level(truncated: float, track: int) -> bool:
     """Return True if a truncation is a level, as in the tracking layout, instead of a share."""
     return isinstance(truncated, int) or (track != NO_TRACK and truncated in LEVELS)
-
-
-def _compute_depths(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
-    return boxes[:, :3] @ calibration.lidar_to_camera[2, :3] + calibration.lidar_to_camera[2, 3]
 
 
 def compute_occlusion_levels(pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:

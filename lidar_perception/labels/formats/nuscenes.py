@@ -48,8 +48,8 @@ from lidar_perception.types import InputError
 
 ROOT = "nuscenes"
 NO_SCORE = -1.0    # of labels, as in nuscenes-devkit
-OUR_NAMES = {**CLASS_BY_NAME, **{theirs: ours for ours, theirs in NAME_BY_CLASS.items()}}
-NUSCENES_NAMES = {ours: theirs for theirs, ours in OUR_NAMES.items()}
+OUR_NAMES = {**CLASS_BY_NAME, **{name: our_name for our_name, name in NAME_BY_CLASS.items()}}
+NUSCENES_NAMES = {our_name: name for name, our_name in OUR_NAMES.items()}
 # nuScenes' classes for our classes that it lacks, such as vans; our name is written as a field.
 SIMILAR_NAMES = {row.name: NUSCENES_NAMES[row.looks_like] for row in TABLE
                  if row.looks_like in NUSCENES_NAMES}
@@ -176,8 +176,8 @@ def _make_columns(task: str, labels: FrameLabels, k: int, pose: np.ndarray,
     extra.pop("tracking_id", None)
     if kind in SIMILAR_NAMES:
         extra["class_name"] = kind
-    if isinstance(given := extra.pop("velocity", None), list) and len(given) == 2:
-        velocity = _parse_velocity(given) or velocity
+    if isinstance(kept := extra.pop("velocity", None), list) and len(kept) == 2:
+        velocity = _parse_velocity(kept) or velocity
     columns = {"velocity": velocity, "attribute_name": attribute,
                f"{task}_name": WRITTEN_NAMES.get(kind, kind),
                f"{task}_score": (float(labels.scores[k]) if np.isfinite(labels.scores[k])

@@ -9,6 +9,7 @@ preserved, that of a cuboid in FrameLabels.extra, that of the drive in DriveLabe
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -212,7 +213,8 @@ def _make_cuboid(labels: FrameLabels, k: int, kind: str, lidar: str) -> dict[str
     box, extra = labels.boxes[k], labels.extra[k]
     x, y, z, length, width, height, yaw = box.tolist()
     cuboid = {"name": "box", "coordinate_system": lidar,
-              "val": [x, y, z, *parts.yaw_to_quaternion(yaw), length, width, height]}
+              "val": [x, y, z, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2), length, width,
+                      height]}
     if KEPT in extra and is_unchanged(box, extra[KEPT]["box"]):
         cuboid = {key: value for key, value in extra[KEPT].items() if key != "box"}
     values = {name: v for name, v in extra.items() if name not in (UID, OTHER, OBJECT, KEPT)}

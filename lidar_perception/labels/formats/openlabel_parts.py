@@ -22,11 +22,6 @@ LIDAR, CAMERA, FIXED = "lidar", "camera", "odom"
 MAX_TILT = 1e-9  # 1 - cosine of the angle between the z axis of a box and the vertical
 
 
-def yaw_to_quaternion(yaw: float) -> list[float]:
-    """Return the quaternion [qx qy qz qw] of a rotation about z."""
-    return [0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)]
-
-
 def cuboid_to_box(val: Sequence[float], to_lidar: np.ndarray) -> tuple[list[float], bool]:
     """Convert a cuboid to a box.
 

@@ -94,7 +94,7 @@ def read_recorded_poses(poses: BagPoses | None, numbers: Sequence[int],
 def _find_base_pose(poses: BagPoses, stamp_ns: int, mount: np.ndarray | None) -> np.ndarray | None:
     if poses.odometry_child == poses.base:
         try:
-            return poses.odometry_pose(stamp_ns)
+            return poses.odometry_poses(np.array([stamp_ns]))[0]
         except MissingTransform:
             return None
     pose = poses(stamp_ns)
