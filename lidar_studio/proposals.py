@@ -137,7 +137,7 @@ def _find_people(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> tuple[
 
 def _add_similar_objects(survey: FrameSurvey, request: ProposalRequest, found: Detections,
                          candidates: Array) -> tuple[Detections, Array]:
-    """Add clusters of the size of another seed where there is no object."""
+    """Add clusters of about the size of a seed, where there is no object."""
     sizes = request.sizes
     if not sizes or not len(survey.shapes):
         return found, candidates

@@ -1,4 +1,7 @@
-"""Fixtures of more than one file: bags and data sets. Those of ROS are the package's own plugin."""
+"""Settings of all tests, and shared fixtures: bags and data sets.
+
+Fixtures for ROS are in the plugin lidar_perception.testing.
+"""
 
 from __future__ import annotations
 
@@ -18,25 +21,25 @@ pytest_plugins = ["lidar_perception.testing"]
 os.environ.pop("COLUMNS", None)  # pytest-xdist sets 80 for its workers; some tests set their own
 keep_freed_memory()  # as commands and nodes do
 
-# No test measures time. --hypothesis-profile deep looks where the everyday run seldom comes.
+# No test measures time. --hypothesis-profile deep tries many more examples.
 settings.register_profile("everyday", deadline=None, max_examples=40)
 settings.register_profile("deep", deadline=None, max_examples=2000)
 settings.load_profile("everyday")
 
 
 def pytest_itemcollected(item):
-    """Hypothesis runs the same lines a hundred times; to measure them takes longer than to run."""
+    """Exclude tests of Hypothesis from coverage, which takes longer than the tests themselves."""
     function = getattr(item, "obj", None)  # a test of launch_testing has none
     if getattr(function, "is_hypothesis_test", False):
         item.add_marker("no_cover")
 
 
 def pytest_collection_finish():
-    """Autograd counts its devices at the first backward. After an ONNX export a torch that is built
-    for CUDA counts one that is not there, and then works in no process that is forked, as runs are
-    that tests kill. So the first backward comes before all tests.
+    """Initialize autograd before all tests, and exclude imported objects from garbage collection.
 
-    What has been imported by then stays: to look through it for garbage takes a while each time."""
+    Autograd counts its devices at the first backward pass. After an ONNX export, a torch built for
+    CUDA counts a missing device and then fails in forked processes, which tests use.
+    """
     if (torch := sys.modules.get("torch")) is not None:
         torch.ones((), requires_grad=True).backward()
     gc.freeze()
@@ -44,9 +47,11 @@ def pytest_collection_finish():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item):
-    """no_cover holds for processes that the test starts, too. After it coverage starts again, and
-    with each start it wraps os._exit once more: a process that is forked later would save its lines
-    as often, for many seconds."""
+    """Apply no_cover to processes that a test starts, too.
+
+    coverage wraps os._exit at each start; without restoring it, processes that are forked later
+    would save their lines many times.
+    """
     with pytest.MonkeyPatch.context() as patch:
         if item.get_closest_marker("no_cover"):
             patch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)
@@ -56,8 +61,8 @@ def pytest_runtest_call(item):
 
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish():
-    """What multiprocessing runs beside us ends now and not some time after us: else coverage would
-    combine its data files while they are written."""
+    """Stop the helper processes of multiprocessing, which would still write coverage files while
+    these are combined."""
     for process in multiprocessing.active_children():
         process.kill()
         process.join()
@@ -67,7 +72,7 @@ def pytest_sessionfinish():
 
 @pytest.fixture(scope="session")
 def data() -> Path:
-    """Real scans that lie beside the checkout, never in it."""
+    """Folder of real scans next to the checkout; the test is skipped without it."""
     from samples import DATA
     if not DATA.is_dir():
         pytest.skip("real data is not beside the checkout (../shared/data)")
@@ -76,15 +81,14 @@ def data() -> Path:
 
 @pytest.fixture
 def carrier_too(monkeypatch):
-    """Networks of random weights see things anywhere, also round the sensor: with this they say so.
-    What is left out there otherwise: test_contract.py."""
+    """Keep detections at the ego vehicle, where networks with random weights find objects, too."""
     from lidar_perception.detectors import normalized_view
     monkeypatch.setattr(normalized_view, "drop_ego_vehicle", lambda detections, height: detections)
 
 
 @pytest.fixture
 def one_thread():
-    """torch with one thread: small networks are slower with more, and wait for busy cores."""
+    """Use one thread of torch, as small networks are slower with more threads on busy cores."""
     import torch
 
     from lidar_perception.runs.threads import set_thread_count
@@ -96,8 +100,7 @@ def one_thread():
 
 @pytest.fixture(scope="module")
 def one_thread_for_all():
-    """As one_thread, for fixtures of the module too: runs are compared bit by bit, and other
-    numbers of threads may add in another order."""
+    """Use one thread of torch in a whole module, for bitwise comparison of training runs."""
     import torch
 
     from lidar_perception.runs.threads import set_thread_count
@@ -109,7 +112,7 @@ def one_thread_for_all():
 
 @pytest.fixture(scope="session")
 def streets():
-    """Each simulated street is made once in a session, as it never changes."""
+    """Cache the simulated streets for the whole session."""
     from functools import cache
 
     from lidar_perception.simulation import drive
@@ -120,7 +123,7 @@ def streets():
 
 @pytest.fixture(scope="session")
 def written(tmp_path_factory) -> Path:
-    """The bag of bag_samples.scans(); tests copy what they change."""
+    """Bag of bag_samples.scans(). Tests must copy it before they change it."""
     from bag_samples import scans
 
     from lidar_perception.data.to_bag import write_bag
@@ -131,7 +134,7 @@ def written(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def tiny_sensor(monkeypatch):
-    """The command knows the sensor of simulate_samples."""
+    """Register the sensor of simulate_samples as a preset."""
     from simulate_samples import TINY
 
     from lidar_perception.simulation.sensor import SENSORS
@@ -140,7 +143,7 @@ def tiny_sensor(monkeypatch):
 
 @pytest.fixture(scope="session")
 def made(streets, tmp_path_factory) -> Path:
-    """A folder of layout -> a data set of five frames that was made in one go."""
+    """Folder with a simulated data set of five frames in each layout."""
     from simulate_samples import TINY, run
 
     from lidar_perception.simulation.dataset import LAYOUTS
@@ -155,7 +158,7 @@ def made(streets, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def crowds(tmp_path_factory) -> Path:
-    """A KITTI folder of people."""
+    """KITTI folder with crowds of people."""
     from experiment_samples import COUNT
     from samples import crowd_folder
     return crowd_folder(tmp_path_factory.mktemp("kitti"), COUNT)
@@ -163,8 +166,7 @@ def crowds(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def whole(crowds, tmp_path_factory) -> Path:
-    """The folder of a run of the paper's experiment on the crowds that nothing has stopped; beside
-    it, what the command said."""
+    """Folder of a complete run of the paper's experiment on `crowds`; its output is in ../said."""
     from experiment_samples import command
     from samples import write
     out = tmp_path_factory.mktemp("whole") / "out"
@@ -176,6 +178,6 @@ def whole(crowds, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def few(tmp_path) -> Path:
-    """Five scans for the small experiment."""
+    """KITTI folder of five scans."""
     from samples import object_folder
     return object_folder(tmp_path / "few", count=5)

@@ -106,7 +106,7 @@ def test_evaluate_takes_own_detector_and_simulated_frames():
     assert lp.evaluate(NearestBox(), drive, limit=1)["frames"] == 1
 
 
-def test_evaluate_opens_what_it_is_named(tmp_path):
+def test_evaluate_opens_names_and_paths(tmp_path):
     folder = object_folder(tmp_path / "kitti")
     result = lp.evaluate(f"{__name__}:NearestBox", folder)
     assert result["frames"] == len(lp.open_recording(folder))

@@ -1,4 +1,4 @@
-"""The shape of the house: which module may import which, and how every room looks."""
+"""Architecture: allowed imports between modules, and rules for all sources."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from samples import for_all
 
-pytestmark = pytest.mark.no_cover  # it reads sources
+pytestmark = pytest.mark.no_cover
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = "lidar_perception", "lidar_studio", "msg_utils"
 SOURCES = [p.relative_to(ROOT).as_posix() for package in PACKAGES
@@ -22,40 +22,42 @@ ROS = {"rclpy", "ament_index_python", "launch", "launch_ros", "launch_testing", 
        "rosbag2_py"}
 MAX_LINES = 400
 
-# From the ground up: a room imports only those before it, and itself.
-ROOMS = ("classes", "intensity", "types", "param_fields", "geometry", "camera", "groups", "robot",
+# The packages and modules from the lowest layer up. Each imports only itself and lower ones.
+LAYERS = ("classes", "intensity", "types", "param_fields", "geometry", "camera", "groups", "robot",
          "runs", "wire", "ground", "data", "clustering", "candidates", "detectors", "tracking",
          "rendering", "scoring", "simulation", "sensor_setup", "training", "labels",
          "detecting", "params", "api", "nodes", "cli", "testing")
-# What the files of a room may import besides the rooms below and the standard library.
-NUMBERS = ["numpy", "scipy", "numba"]
-STRANGERS = {
+# Libraries that each layer may import besides lower layers and the standard library.
+NUMERIC = ["numpy", "scipy", "numba"]
+LIBRARIES = {
     "classes": [], "intensity": ["numpy"], "types": ["numpy"], "param_fields": [],
-    "geometry": ["numpy", "numba"], "camera": NUMBERS,
+    "geometry": ["numpy", "numba"], "camera": NUMERIC,
     "groups": ["numpy"], "robot": ["numpy", "scipy"],
     "runs": ["rich", "threadpoolctl", "numba"],
     "wire": ["numpy", "scipy", "rosbags", "msg_utils", "lz4", "zstandard"],
     "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils", "lz4", "zstandard"],
-    "ground": NUMBERS, "clustering": NUMBERS, "candidates": NUMBERS,
-    "detectors": [*NUMBERS, "llvmlite", "torch", "safetensors", "onnx", "onnxruntime",
+    "ground": NUMERIC, "clustering": NUMERIC, "candidates": NUMERIC,
+    "detectors": [*NUMERIC, "llvmlite", "torch", "safetensors", "onnx", "onnxruntime",
                   "onnxscript"],
-    "tracking": [*NUMBERS, "kiss_icp"],
+    "tracking": [*NUMERIC, "kiss_icp"],
     "rendering": ["numpy", "PIL", "matplotlib", "av", "msg_utils"],
     "sensor_setup": ["numpy", "scipy", "msg_utils"],
     "labels": ["numpy", "msg_utils"], "params": [],
 }
 
 
-@cache  # parsed by the first test: every process that collects the tests imports this file
-def tree_of(name):
+@cache  # not parsed on import, as each test process imports this file
+def parse_source(name):
     return ast.parse((ROOT / name).read_text(encoding="utf-8"), name)
 
 
 @cache
-def imports(name, everywhere=True):
-    """Modules that a source imports; `from a import b` counts as a.b. Those inside functions and
-    `if TYPE_CHECKING` only with everywhere."""
-    nodes = ast.walk(tree_of(name)) if everywhere else _run_on_import(tree_of(name))
+def find_imports(name, everywhere=True):
+    """Return the modules that a source imports; a.b for `from a import b`.
+
+    everywhere: include imports in functions and under `if TYPE_CHECKING`.
+    """
+    nodes = ast.walk(parse_source(name)) if everywhere else _run_on_import(parse_source(name))
     found = set()
     for node in nodes:
         if isinstance(node, ast.Import):
@@ -79,21 +81,21 @@ def _run_on_import(tree):
         waiting += ast.iter_child_nodes(node)
 
 
-def within(module, allowed):
+def is_in(module, allowed):
     return any(module == name or module.startswith(name + ".") for name in allowed)
 
 
-def standard(module):
+def is_standard(module):
     return module.partition(".")[0] in sys.stdlib_module_names
 
 
-def files_in(*folders):
+def list_files(*folders):
     return [name for name in SOURCES if any(name.startswith(f"{folder}/") for folder in folders)]
 
 
-def strangers(name, allowed, everywhere=True):
-    return sorted(m for m in imports(name, everywhere)
-                  if not standard(m) and not within(m, allowed))
+def find_foreign_imports(name, allowed, everywhere=True):
+    return sorted(m for m in find_imports(name, everywhere)
+                  if not is_standard(m) and not is_in(m, allowed))
 
 
 def public_functions(tree):
@@ -101,96 +103,96 @@ def public_functions(tree):
             and not node.name.startswith("_")]
 
 
-def test_there_are_sources_to_look_at():
-    assert len(files_in("msg_utils")) >= 5
+def test_every_layer_is_found():
+    assert len(list_files("msg_utils")) >= 5
     assert {n.split("/")[1].removesuffix(".py") for n in SOURCES
-            if n.startswith("lidar_perception/")} == {*ROOMS, "__init__"}
-    for folder in ROOMS[7:ROOMS.index("params")]:
-        assert len(files_in(f"lidar_perception/{folder}")) >= 2
+            if n.startswith("lidar_perception/")} == {*LAYERS, "__init__"}
+    for folder in LAYERS[7:LAYERS.index("params")]:
+        assert len(list_files(f"lidar_perception/{folder}")) >= 2
 
 
-@for_all(files_in("msg_utils"))
-def test_msg_utils_needs_numpy_and_itself_only(name):
-    # ROS's message classes come in by name (messages.py), so that rosbags' own do as well.
-    assert strangers(name, ["numpy", "msg_utils"]) == []
+@for_all(list_files("msg_utils"))
+def test_msg_utils_needs_only_numpy(name):
+    # messages.py imports ROS's message classes by name; those of rosbags work, too.
+    assert find_foreign_imports(name, ["numpy", "msg_utils"]) == []
 
 
-def test_only_messages_of_msg_utils_imports_by_name():
-    by_name = [name for name in files_in("msg_utils")
-               if any(m.startswith("importlib") for m in imports(name))]
+def test_only_msg_utils_messages_imports_by_name():
+    by_name = [name for name in list_files("msg_utils")
+               if any(m.startswith("importlib") for m in find_imports(name))]
     assert by_name == ["msg_utils/messages.py"]
 
 
-OUTSIDE = [name for name in SOURCES
-           if not name.startswith((*(f"lidar_perception/{room}/" for room in ROOMS[-3:]),
+CORE = [name for name in SOURCES
+           if not name.startswith((*(f"lidar_perception/{layer}/" for layer in LAYERS[-3:]),
                                    "lidar_studio/cli/", "lidar_studio/live_view.py"))]
 
 
-@for_all(OUTSIDE)
-def test_the_core_imports_no_ros_no_nodes_and_no_command_line(name):
-    ros = {m for m in imports(name) if m.partition(".")[0] in ROS}
+@for_all(CORE)
+def test_core_imports_neither_ros_nor_nodes_nor_cli(name):
+    ros = {m for m in find_imports(name) if m.partition(".")[0] in ROS}
     assert ros == set()
-    above = [m for m in imports(name)
-             if within(m, ["lidar_perception.nodes", "lidar_perception.cli"])]
+    above = [m for m in find_imports(name)
+             if is_in(m, ["lidar_perception.nodes", "lidar_perception.cli"])]
     assert above == []
 
 
-@for_all(files_in("lidar_perception", "msg_utils"))
+@for_all(list_files("lidar_perception", "msg_utils"))
 def test_library_never_imports_the_studio(name):
-    assert [m for m in imports(name) if within(m, ["lidar_studio"])] == []
+    assert [m for m in find_imports(name) if is_in(m, ["lidar_studio"])] == []
 
 
 @for_all(SOURCES)
 def test_wheel_never_imports_repository_folders(name):
-    assert [m for m in imports(name)
-            if within(m, ["experiments", "benchmark", "scripts", "test"])] == []
+    assert [m for m in find_imports(name)
+            if is_in(m, ["experiments", "benchmark", "scripts", "test"])] == []
 
 
 @for_all([name for name in SOURCES if not name.startswith("lidar_perception/nodes/")])
-def test_rclpy_is_imported_by_nodes_alone(name):
-    assert [m for m in imports(name) if within(m, ["rclpy"])] == []
+def test_only_nodes_import_rclpy(name):
+    assert [m for m in find_imports(name) if is_in(m, ["rclpy"])] == []
 
 
-@for_all(files_in("lidar_perception/cli"))
-def test_the_command_line_imports_no_ros_when_it_is_imported(name):
-    ros = {m for m in imports(name, everywhere=False) if m.partition(".")[0] in ROS}
+@for_all(list_files("lidar_perception/cli"))
+def test_importing_the_cli_does_not_import_ros(name):
+    ros = {m for m in find_imports(name, everywhere=False) if m.partition(".")[0] in ROS}
     assert ros == set()
 
 
-def room(name):
-    """Of a module or a file's name."""
+def get_layer(name):
+    """Return the layer of a module or file by its name."""
     return name.replace("/", ".").split(".")[1] if "." in name.replace("/", ".") else ""
 
 
 @for_all([n for n in SOURCES if n.startswith("lidar_perception/")
           and n != "lidar_perception/__init__.py"])
-def test_no_arrow_points_up(name):
-    """Imports inside functions count, and those for types."""
-    below = ROOMS[:ROOMS.index(room(name.removesuffix(".py"))) + 1]
-    above = [m for m in imports(name) if m.startswith("lidar_perception.")
-             and m != "lidar_perception.__version__" and room(m) not in below]
+def test_layers_import_only_lower_layers(name):
+    below = LAYERS[:LAYERS.index(get_layer(name.removesuffix(".py"))) + 1]
+    above = [m for m in find_imports(name) if m.startswith("lidar_perception.")
+             and m != "lidar_perception.__version__" and get_layer(m) not in below]
     assert above == []
 
 
-@for_all([n for n in files_in("lidar_studio") if n in OUTSIDE])
-def test_the_studio_needs_few_other_libraries(name):
-    assert strangers(name, ["numpy", "aiohttp", "msg_utils", "lidar_perception",
+@for_all([n for n in list_files("lidar_studio") if n in CORE])
+def test_studio_imports_only_allowed_libraries(name):
+    assert find_foreign_imports(name, ["numpy", "aiohttp", "msg_utils", "lidar_perception",
                             "lidar_studio"]) == []
 
 
-@for_all([n for n in files_in("lidar_perception") if room(n.removesuffix(".py")) in STRANGERS])
-def test_a_room_of_the_core_needs_no_other_library(name):
-    allowed = [*STRANGERS[room(name.removesuffix(".py"))], "lidar_perception"]
-    assert strangers(name, allowed) == []
+@for_all([n for n in list_files("lidar_perception")
+          if get_layer(n.removesuffix(".py")) in LIBRARIES])
+def test_layers_import_only_allowed_libraries(name):
+    allowed = [*LIBRARIES[get_layer(name.removesuffix(".py"))], "lidar_perception"]
+    assert find_foreign_imports(name, allowed) == []
 
 
 NETWORKS = "lidar_perception.detectors.pointpillars", "lidar_perception.detectors.pointnet"
 
 
-@for_all(files_in(*(n.replace(".", "/") for n in NETWORKS)))
-def test_a_network_knows_no_other(name):
+@for_all(list_files(*(n.replace(".", "/") for n in NETWORKS)))
+def test_networks_do_not_import_each_other(name):
     other, = (n for n in NETWORKS if not name.startswith(n.replace(".", "/")))
-    assert [m for m in imports(name) if within(m, [other])] == []
+    assert [m for m in find_imports(name) if is_in(m, [other])] == []
 
 
 SHARED_TRAINING = [f"lidar_perception/training/{name}.py" for name in (
@@ -198,17 +200,16 @@ SHARED_TRAINING = [f"lidar_perception/training/{name}.py" for name in (
     "trainer", "augment", "pasting", "database", "data")]
 
 @for_all(SHARED_TRAINING)
-def test_what_all_networks_train_with_knows_none_of_them(name):
-    assert [m for m in imports(name) if within(m, NETWORKS)] == []
+def test_shared_training_imports_no_network(name):
+    assert [m for m in find_imports(name) if is_in(m, NETWORKS)] == []
 
 
-def test_modules_do_not_import_in_circles():
-    """Imports inside functions count, and those for types."""
+def test_modules_have_no_circular_imports():
     modules = {name.removesuffix(".py").removesuffix("/__init__").replace("/", "."): name
                for name in SOURCES}
     packages = {name.removesuffix("/__init__.py").replace("/", ".") for name in SOURCES
                 if name.endswith("/__init__.py")}
-    arrows = {m: {other for i in imports(name)
+    imported_by_module = {m: {other for i in find_imports(name)
                   for other in (i, i.rpartition(".")[0])
                   if other in modules and other not in packages and other != m}
               for m, name in modules.items()}
@@ -218,7 +219,7 @@ def test_modules_do_not_import_in_circles():
         assert module not in path, " -> ".join([*path[path.index(module):], module])
         if module not in done:
             path.append(module)
-            for other in arrows[module]:
+            for other in imported_by_module[module]:
                 visit(other)
             done.add(path.pop())
 
@@ -226,41 +227,42 @@ def test_modules_do_not_import_in_circles():
         visit(module)
 
 
-FORMATS = ("lidar_perception/classes.py", "lidar_perception/data/",  # whose words these are
-           "lidar_perception/simulation/shapes/",  # each class has a shape of its own
-           "lidar_perception/detectors/pointpillars/import_weights.py")
+NAMING_CLASSES = ("lidar_perception/classes.py",
+                  "lidar_perception/data/",  # the names of formats
+                  "lidar_perception/simulation/shapes/",  # a shape per class
+                  "lidar_perception/detectors/pointpillars/import_weights.py")
 
 
 @for_all([n for n in SOURCES if n.startswith("lidar_perception/")
-          and not n.startswith(FORMATS)])
-def test_a_class_is_named_in_one_table(name):
+          and not n.startswith(NAMING_CLASSES)])
+def test_class_names_are_only_in_their_table(name):
     from lidar_perception.classes import CLASSES
-    written = {node.value for node in ast.walk(tree_of(name)) if isinstance(node, ast.Constant)
+    written = {node.value for node in ast.walk(parse_source(name)) if isinstance(node, ast.Constant)
                and isinstance(node.value, str)}
     assert written & set(CLASSES) - {"DontCare", "Misc"} == set()
 
 
-@for_all(OUTSIDE)
+@for_all(CORE)
 def test_every_public_function_has_a_docstring(name):
-    without = [node.name for node in public_functions(tree_of(name))
+    without = [node.name for node in public_functions(parse_source(name))
                if isinstance(node, ast.FunctionDef) and not ast.get_docstring(node)]
     assert without == []
 
 
-STRICT = tuple(f"lidar_perception/{room}" for room in ROOMS[:ROOMS.index("data")] + (
+STRICT = tuple(f"lidar_perception/{layer}" for layer in LAYERS[:LAYERS.index("data")] + (
     "clustering", "candidates", "tracking", "sensor_setup", "labels")
-    if room != "runs") + ("lidar_studio", "msg_utils")
+    if layer != "runs") + ("lidar_studio", "msg_utils")
 
 
 @for_all([n for n in SOURCES if n.startswith(STRICT)])
-def test_every_function_of_the_core_says_its_types_but_those_that_numba_compiles(name):
-    """mypy asks for all or none (setup.cfg); Numba reads none."""
+def test_core_functions_without_numba_have_types(name):
+    """mypy would also require types in functions for Numba, which ignores them (setup.cfg)."""
     def typed(node):
         named = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs,
                  *filter(None, (node.args.vararg, node.args.kwarg))]
         return (node.returns or node.name == "__init__") and all(
             a.annotation or a.arg in ("self", "cls") for a in named)
-    assert [node.name for node in ast.walk(tree_of(name)) if isinstance(node, ast.FunctionDef)
+    assert [node.name for node in ast.walk(parse_source(name)) if isinstance(node, ast.FunctionDef)
             and not any("njit" in ast.unparse(d) for d in node.decorator_list)
             and not typed(node)] == []
 
@@ -268,39 +270,39 @@ def test_every_function_of_the_core_says_its_types_but_those_that_numba_compiles
 def test_mypy_ignores_no_module():
     settings = ConfigParser()
     settings.read(ROOT / "setup.cfg")
-    asked = {name: dict(settings[name]) for name in settings if name.startswith("mypy")}
-    assert asked["mypy"]["files"] == (
+    sections = {name: dict(settings[name]) for name in settings if name.startswith("mypy")}
+    assert sections["mypy"]["files"] == (
         "lidar_perception, lidar_studio, msg_utils, scripts, benchmark, experiments, examples")
-    assert {name for name, options in asked.items()
+    assert {name for name, options in sections.items()
             if {"ignore_errors", "exclude", "follow_imports"} & set(options)} == {"mypy-launch"}
     assert [name for name in SOURCES if "# mypy:" in (ROOT / name).read_text()] == []
 
 
 @for_all(SOURCES)
-def test_every_module_says_what_it_is_for_and_is_no_room_for_odds_and_ends(name):
-    assert ast.get_docstring(tree_of(name)), "no docstring"
+def test_modules_have_a_docstring_and_a_specific_name(name):
+    assert ast.get_docstring(parse_source(name)), "no docstring"
     parts = Path(name).with_suffix("").parts
     assert not {"utils", "util", "helpers", "common", "misc"} & set(parts)
 
 
 @for_all(SOURCES)
-def test_no_source_is_longer_than_a_reader_can_hold(name):
+def test_no_source_has_more_than_the_maximum_of_lines(name):
     assert len((ROOT / name).read_text(encoding="utf-8").splitlines()) <= MAX_LINES
 
 
-def test_a_number_of_clustering_goes_by_a_name_of_its_own():
-    """Its modules take each other's, and a reader must not take one for the other."""
-    homes = {}
-    for name in files_in("lidar_perception/clustering"):
-        for node in tree_of(name).body:
+def test_constants_of_clustering_have_unique_names():
+    """Modules import constants from each other, so equal names would be confusing."""
+    files_by_name = {}
+    for name in list_files("lidar_perception/clustering"):
+        for node in parse_source(name).body:
             if isinstance(node, ast.Assign) and isinstance(node.value, (ast.Constant, ast.BinOp)):
                 for target in node.targets:
-                    homes.setdefault(ast.unparse(target), []).append(name)
-    assert len(homes) > 10 and {n: w for n, w in homes.items() if len(w) > 1} == {}
+                    files_by_name.setdefault(ast.unparse(target), []).append(name)
+    assert len(files_by_name) > 10 and {n: w for n, w in files_by_name.items() if len(w) > 1} == {}
 
 
-# What modules do without. Those of one list are imported one after the other by one interpreter,
-# which a second takes to start; each must do without what the ones after it load.
+# Modules, and libraries that they must not load. One interpreter imports those of a list one after
+# the other, as each start takes a second; so a module must not load what the later ones exclude.
 LIGHT = [
     ("msg_utils.point_cloud2", "numba torch matplotlib scipy rosbags lidar_perception"),
     ("msg_utils.markers", "numba torch matplotlib scipy rosbags lidar_perception"),
@@ -342,7 +344,7 @@ LIGHT = [
     ("lidar_perception.detectors.pointnet.detector",
      "onnx onnxruntime matplotlib sklearn rich click"),
 ]
-IMPORTING = """
+IMPORT_SCRIPT = """
 import importlib, sys
 for case in sys.argv[1:]:
     module, *heavy = case.split()
@@ -353,14 +355,14 @@ for case in sys.argv[1:]:
 
 
 @pytest.mark.parametrize("cases", LIGHT, ids=["core", "commands", "networks"])
-def test_importing_a_module_does_not_load_what_it_does_not_need(cases):
-    result = subprocess.run([sys.executable, "-c", IMPORTING, *map(" ".join, cases)], cwd=ROOT,
+def test_importing_a_module_loads_no_unneeded_library(cases):
+    result = subprocess.run([sys.executable, "-c", IMPORT_SCRIPT, *map(" ".join, cases)], cwd=ROOT,
                             capture_output=True, text=True, check=True)
     assert result.stdout == ""
 
 
-def test_test_files_import_no_other_test_file():
-    """What they share is in test/support or in a conftest.py."""
+def test_test_files_do_not_import_each_other():
+    """Shared code is in test/support or in a conftest.py."""
     for path in sorted((ROOT / "test").rglob("*.py")):
         imported = {name.split(".")[-1] for node in ast.walk(ast.parse(path.read_text()))
                     for name in ([node.module or ""] if isinstance(node, ast.ImportFrom)

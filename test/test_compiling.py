@@ -80,7 +80,7 @@ def test_cache_is_found_where_numba_keeps_it(tmp_path):
     assert done.stdout.split() == ["False", "True"]
 
 
-def test_second_process_compiles_during_the_block_and_is_waited_for(tmp_path, monkeypatch):
+def test_block_waits_for_another_process_that_compiles(tmp_path, monkeypatch):
     log, lines, done = tmp_path / "compile.log", [], tmp_path / "done"
     code = ("import pathlib, time; time.sleep(0.3); print('said'); "
             f"pathlib.Path({str(done)!r}).touch()")

@@ -1,4 +1,4 @@
-"""The pages of the nodes say what the nodes do."""
+"""Generated pages match the code, and links of all pages exist."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_every_node_has_a_page():
 
 
 @pytest.mark.parametrize("name", NODES)
-def test_pages_are_made_from_the_code(generate, name):
+def test_pages_match_the_code(generate, name):
     page = ROOT / "docs" / "reference" / "nodes" / f"{name}.md"
     assert page.read_text() == generate.page(name), "run: python docs/generate.py"
 
@@ -71,7 +71,7 @@ def test_options_for_readings_of_the_papers_exist():
 @pytest.mark.parametrize("name", ["ground_segmentation", "clustering", "candidate_refinement",
                                   "perception", "evaluator", "pointpillars_detector",
                                   "pointnet_detector", "fused_detector", "tracker"])
-def test_documented_topics_are_the_nodes_own(generate, name, domain):
+def test_documented_topics_are_those_of_the_node(generate, name, domain):
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     from lidar_perception.nodes.external_node import create_context, shut_down_context
     context = create_context(domain)
@@ -97,13 +97,13 @@ def test_documented_topics_are_the_nodes_own(generate, name, domain):
 
 @pytest.mark.parametrize("page", [*ROOT.glob("docs/**/*.md"), ROOT / "README.md"],
                          ids=lambda p: str(p.relative_to(ROOT)))
-def test_links_lead_somewhere(page):
+def test_link_targets_exist(page):
     for target in re.findall(r"\]\(([^)#]+)", page.read_text()):
         if "://" not in target:
             assert (page.parent / target).exists(), target
 
 
-def test_the_parameter_file_of_best_is_made_from_the_code(generate):
+def test_parameter_file_of_best_matches_the_code(generate):
     from lidar_perception.candidates.configurations import BEST_VALUES
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
@@ -115,7 +115,7 @@ def test_the_parameter_file_of_best_is_made_from_the_code(generate):
 
 
 @pytest.mark.parametrize("network", ["pointpillars", "pointnet", "fused"])
-def test_the_nodes_before_a_detector_get_its_numbers(generate, network):
+def test_nodes_of_a_detector_graph_share_its_parameters(generate, network):
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
     from lidar_perception.param_fields import with_values

@@ -1,4 +1,4 @@
-"""The scripts and the notebook of examples/ run, and stay short."""
+"""The scripts and the notebook of examples/ are short and run."""
 
 from __future__ import annotations
 
@@ -35,9 +35,8 @@ def test_examples_are_short_and_use_the_public_interface():
 
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
-    """Run an example in an empty folder with arguments; return what it prints.
-
-    Simulated drives are short and sparse, so that it takes little time."""
+    """Return a function that runs an example in an empty folder, with short simulated drives, and
+    returns its output."""
     simulate = lp.simulate
 
     def small(frames=40, *args, **options):
@@ -66,8 +65,8 @@ def test_example_runs_on_simulated_scans(run, name, words):
 def test_example_takes_your_data(run, tmp_path):
     np.save(tmp_path / "cloud.npy", scene(0))
     assert "patchwork: " in run("ground_and_clusters.py", tmp_path / "cloud.npy")
-    said = run("evaluate.py", object_folder(tmp_path / "kitti"), "pointnet")
-    assert "pointnet on 2 frames" in said and "Pedestrian" in said
+    output = run("evaluate.py", object_folder(tmp_path / "kitti"), "pointnet")
+    assert "pointnet on 2 frames" in output and "Pedestrian" in output
 
 
 def test_example_writes_simulated_clouds(run, tmp_path):

@@ -1,4 +1,4 @@
-"""Laws of boxes, angles, ranges, usable returns and the view of a camera."""
+"""Boxes, angles, ranges, usable returns and the view of a camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scale of intensities, and arrays in place of a PointCloud."""
+"""Scale of intensities, and arrays instead of a PointCloud."""
 
 from __future__ import annotations
 

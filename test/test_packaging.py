@@ -22,14 +22,14 @@ pytestmark = pytest.mark.skipif(not (ROOT / "setup.py").exists(), reason="needs 
 
 @pytest.fixture
 def metadata(monkeypatch):
-    """Return what setup.py hands to setuptools, built from a repository at `url`."""
+    """Return a function that returns the arguments of setup() for a repository URL."""
     def read(url):
-        given = {}
+        arguments = {}
         monkeypatch.chdir(ROOT)
         monkeypatch.setenv("LIDAR_REPOSITORY_URL", url)
-        monkeypatch.setattr(setuptools, "setup", given.update)
+        monkeypatch.setattr(setuptools, "setup", arguments.update)
         run_path(str(ROOT / "setup.py"))
-        return given
+        return arguments
     return read
 
 
@@ -48,9 +48,10 @@ def test_readme_on_a_package_index_has_no_relative_link(metadata):
 
 
 def test_project_urls_follow_the_repository(metadata):
-    given = metadata(URL)
-    assert given["url"] == URL and set(given["project_urls"]) >= {"Source", "Issues", "Changelog"}
-    assert all(page.startswith(URL) for page in given["project_urls"].values())
+    arguments = metadata(URL)
+    assert arguments["url"] == URL
+    assert set(arguments["project_urls"]) >= {"Source", "Issues", "Changelog"}
+    assert all(page.startswith(URL) for page in arguments["project_urls"].values())
 
 
 def test_both_packages_ship_their_types(metadata):
@@ -88,13 +89,13 @@ def test_citation_names_the_three_papers():
     assert all(paper["doi"].startswith("10.") for paper in cited["references"])
 
 
-def test_each_node_has_one_executable_beside_the_package(metadata):
-    """In lib, so that no `tracker` or `evaluator` of ours is on a user's path."""
-    given = metadata(URL)
-    files = dict(given["data_files"])["lib/lidar_perception"]
+def test_each_node_has_one_executable_in_lib(metadata):
+    """Not in bin, so that names such as `tracker` are not on the PATH of users."""
+    arguments = metadata(URL)
+    files = dict(arguments["data_files"])["lib/lidar_perception"]
     assert sorted(Path(file).name for file in files) == sorted(NODES)
     assert all(os.access(ROOT / file, os.X_OK) for file in files)
-    assert [line.split()[0] for line in given["entry_points"]["console_scripts"]] == [
+    assert [line.split()[0] for line in arguments["entry_points"]["console_scripts"]] == [
         "lidar-perception"]
 
 

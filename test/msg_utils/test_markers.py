@@ -1,4 +1,4 @@
-"""Boxes <-> markers and detections, and what one array does to the next."""
+"""Conversion of boxes to markers and detections and back, and successive arrays."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def keys(rows):
 
 
 def same_boxes(a, b) -> bool:
-    """Numbers equal; yaw went through a quaternion, and pi is -pi."""
+    """Return True for equal boxes, up to rounding of the yaw, with pi equal to -pi."""
     a, b = (np.reshape(x, (-1, 7)) for x in (a, b))
     turned = np.abs((a[:, 6] - b[:, 6] + np.pi) % (2 * np.pi) - np.pi)
     return np.array_equal(a[:, :6], b[:, :6]) and bool((turned < 1e-12).all())

@@ -1,4 +1,4 @@
-"""PointCloud2 <-> structured arrays, byte by byte."""
+"""Conversion of PointCloud2 to structured arrays and back, byte by byte."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 
 @st.composite
 def layouts(draw) -> np.dtype:
-    """Any dtype a cloud can have: every datatype, gaps, counts, byte orders, field orders."""
+    """Draw dtypes of clouds, with all datatypes, gaps, counts, byte and field orders."""
     names = draw(st.lists(st.sampled_from(["x", "y", "z", "intensity", "ring", "t"]), min_size=1,
                           unique=True))
     order = draw(st.sampled_from("<>"))
@@ -46,7 +46,7 @@ def layouts(draw) -> np.dtype:
 
 @st.composite
 def points(draw, count=st.integers(0, 12)) -> np.ndarray:
-    """Points of any layout, all bits random, NaN and padding too."""
+    """Draw points of any layout with random bits, including NaN and padding."""
     dtype, n = draw(layouts()), draw(count)
     seed = draw(st.integers(0, 2**16))
     raw = np.random.default_rng(seed).integers(0, 256, n * dtype.itemsize, dtype=np.uint8)
@@ -293,7 +293,7 @@ def test_rows_of_different_length_are_refused(make):
 
 @each_make
 @pytest.mark.parametrize("height, width", [(1, 0), (0, 1), (0, 2**32 - 1), (1, 1)])
-def test_a_point_step_beyond_all_reason_is_named_with_points_and_without(make, height, width):
+def test_huge_point_step_is_reported_with_and_without_points(make, height, width):
     fields = [field(make, name, 4 * i) for i, name in enumerate("xyz")]
     msg = message(make, fields, np.zeros(12, np.uint8), height=height, width=width,
                   point_step=2**32 - 1, row_step=0)
