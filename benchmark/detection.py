@@ -65,8 +65,8 @@ def _compute_medians(detectors: dict[str, PointPillarsDetector], scans: list[Poi
     for i, scan in enumerate(show_progress(scans, title, len(scans))):
         for j in range(repeat):
             for version, detector in detectors.items():
-                said = detector(scan).timings
-                ms[version][i, j] = [said[step] for step in STEPS]
+                timings = detector(scan).timings
+                ms[version][i, j] = [timings[step] for step in STEPS]
     found: dict[str, dict] = {}
     for version, runs in ms.items():
         steps = np.median(np.median(runs, axis=1), axis=0)
@@ -102,15 +102,15 @@ def _make_detector(version: str, size: str, device: str,
     """Return a warmed-up detector whose thresholds CANDIDATES anchors of this scan pass."""
     config = make_config(version, size)
     torch.manual_seed(0)
-    heard = RecordingNetwork(TorchNetwork(make_network(config).eval(), device))
-    detector = PointPillarsDetector(PointPillarsProposer(heard, Header(config), device))
+    recording = RecordingNetwork(TorchNetwork(make_network(config).eval(), device))
+    detector = PointPillarsDetector(PointPillarsProposer(recording, Header(config), device))
     detector.warm_up()
     detector(scan)
-    assert heard.logits is not None
-    best = np.sort(expit(heard.logits.max(axis=1)))
+    assert recording.logits is not None
+    best = np.sort(expit(recording.logits.max(axis=1)))
     least = float(best[-min(CANDIDATES, len(best))])
     detector = detector.with_min_score(least)
-    detector.proposer.network = heard.network
+    detector.proposer.network = recording.network
     detector(scan)
     return detector
 

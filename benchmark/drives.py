@@ -110,9 +110,10 @@ def _scores(peers: list[tuple], ours: list[tuple]) -> dict:
     for name, counted in ("peer", peers), ("ours", ours):
         clear = sum((c for _, c in counted), ClearCounts())
         hota = resample(counted, lambda chosen: sum((h for h, _ in chosen), HotaCounts()
-                                                    ).scores()["HOTA"])
-        both[name] = {**sum((h for h, _ in counted), HotaCounts()).scores(), **clear.scores(),
-                      "interval": _interval(hota), "switches": clear.switches,
+                                                    ).compute_scores()["HOTA"])
+        both[name] = {**sum((h for h, _ in counted), HotaCounts()).compute_scores(),
+                      **clear.compute_scores(), "interval": _interval(hota),
+                      "switches": clear.switches,
                       "fragments": clear.fragments, "hits": clear.tp, "false": clear.fp}
         both[name]["values"] = hota
     difference = np.subtract(both["ours"].pop("values"), both["peer"].pop("values"))

@@ -54,9 +54,9 @@ def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
         calls["plain PointNet++ (SSG)"] = partial(_plain, plain, some, config.points)
         calls["detector"] = partial(detector, scan)
         time_interleaved(calls, 1)
-        ms, said = time_interleaved(calls, repeat)
+        ms, results = time_interleaved(calls, repeat)
         rows.append(ms)
-        steps.append([said["detector"].timings[step] for step in STEPS])
+        steps.append([results["detector"].timings[step] for step in STEPS])
         counts.append((len(some), len(every), len(scan)))
     middle = np.median(counts, axis=0)
     return {"clusters": float(middle[0]), "all_clusters": float(middle[1]),

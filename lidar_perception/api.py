@@ -204,7 +204,7 @@ def evaluate(detector: str | Path | Detector | Callable[[PointCloud], Detections
         reason = f" ({report.skipped[0]})" if report.skipped else ""
         raise InputError(f"{recording.path}: no frame with labels{reason}")
     content = report.compute()
-    return {**content, "intervals": report.intervals(intervals)} if intervals else content
+    return {**content, "intervals": report.compute_intervals(intervals)} if intervals else content
 
 
 def simulate(frames: int = 40, seed: int = 1, sensor: str = "hdl64e", scene: str = "street", *,

@@ -66,7 +66,7 @@ def evaluate_weights(weights: Path, folder: Path) -> dict[str, Any]:
     report = DetectionReport(follow=recording.is_sequential)
     fill(report, recording, partial(
         measure_detector, partial(open_detector, weights, min_score=MIN_SCORE), 1.0, None))
-    return {**report.compute(), "intervals": report.intervals(SAMPLES)}
+    return {**report.compute(), "intervals": report.compute_intervals(SAMPLES)}
 
 
 def format_card(header: checkpoint.Header, title: str, scored: dict[str, dict[str, Any]]) -> str:

@@ -131,17 +131,17 @@ def summarize(contender: Contender, report: DetectionReport, resamples: int = 0)
     precision = {name: {row: {level: _get_r40(ap[name][row][level]) for level in DIFFICULTIES}
                         for row in AP_ROWS} if name in contender.classes else None
                  for name in ap}
-    scores = {"operating": contender.operating, "best": centres.best_score()}
+    scores = {"operating": contender.operating, "best": centres.find_best_score()}
     intervals = {"intervals": {
         "ap": {name: rows if name in contender.classes else None
-               for name, rows in report.intervals(resamples).items()},
+               for name, rows in report.compute_intervals(resamples).items()},
         "f1": centres.compute_f1_interval(contender.operating, resamples, report.follow)}
         } if resamples else {}
     return {
         "weights": contender.source, "classes": list(contender.classes),
         "ap": precision, "mean_ap": {row: compute_mean_moderate(precision, row) for row in AP_ROWS},
         "pedestrian_centres": {
-            key: {"score": score, **centres.table(np.inf if score is None else score)["all"]}
+            key: {"score": score, **centres.make_rows(np.inf if score is None else score)["all"]}
             for key, score in scores.items()},
         "ms": float(np.median(report.ms)) if report.ms else None,
         "ms_of_frames": [round(ms, 3) for ms in report.ms],

@@ -1,6 +1,6 @@
 """Points sorted into cubic cells as wide as a search radius ("reach").
 
-Each cell knows the ranges of cells that hold all its points' neighbours.
+Of each cell, the ranges of cells that contain all neighbours of its points are stored.
 """
 
 from __future__ import annotations

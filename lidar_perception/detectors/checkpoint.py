@@ -16,7 +16,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from lidar_perception.detectors.config_json import parse_config
-from lidar_perception.detectors.layer_weights import Misfit
+from lidar_perception.detectors.layer_weights import WeightsMismatch
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.runs.files import write_bytes
@@ -210,12 +210,12 @@ def read_arrays(path: str | Path, kind: type[Config]) -> tuple[Header, dict[str,
 
     Raises:
         InputError: see read_header.
-        Misfit: a tensor has a number format that NumPy lacks, such as bf16.
+        WeightsMismatch: a tensor has a number format that NumPy lacks, such as bf16.
     """
     try:
         text, tensors = _read(Path(path), framework="np")
     except (TypeError, AttributeError) as error:  # of safetensors
-        raise Misfit(str(error)) from None
+        raise WeightsMismatch(str(error)) from None
     return Header.from_json(text, str(path), kind), tensors
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 
-class Misfit(ValueError):
+class WeightsMismatch(ValueError):
     """The tensors do not belong to the network. checkpoint.load_checkpoint(), which needs torch,
     names the first one that differs."""
 
@@ -41,7 +41,7 @@ class LayerWeights:
                 in, the layer has a bias and the norm does not exist.
 
         Raises:
-            Misfit: the layer is missing or has another shape.
+            WeightsMismatch: the layer is missing or has another shape.
         """
         weight = self.array(f"{name}.weight", shape)
         if norm is None or f"{norm}.weight" not in self.tensors:
@@ -50,21 +50,21 @@ class LayerWeights:
             "weight", "bias", "running_mean", "running_var"))
         count = self.tensors.pop(f"{norm}.num_batches_tracked", None)
         if count is None or count.shape or count.dtype != np.int64:
-            raise Misfit(f"{norm}.num_batches_tracked")
+            raise WeightsMismatch(f"{norm}.num_batches_tracked")
         scale = scale / np.sqrt(variance + np.float32(self.eps))
         return Weights(weight * scale.reshape(-1, *[1] * (len(shape) - 1)), shift - mean * scale)
 
     def array(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """Return a tensor of floats as float32, or raise Misfit."""
+        """Return a tensor of floats as float32, or raise WeightsMismatch."""
         found = self.tensors.pop(name, None)
         if found is None or found.shape != shape or not np.issubdtype(found.dtype, np.floating):
-            raise Misfit(name)
+            raise WeightsMismatch(name)
         return found.astype(np.float32)
 
     def finish(self) -> None:
-        """Raise Misfit if a tensor has not been taken."""
+        """Raise WeightsMismatch if a tensor has not been taken."""
         for name in self.tensors:
-            raise Misfit(name)
+            raise WeightsMismatch(name)
 
 
 def to_arrays(network: Any) -> dict[str, np.ndarray]:

@@ -65,7 +65,7 @@ class TrainedNetwork:
         other.header = header
         return other
 
-    def raw_scores(self, scores: Mapping[str, float]) -> list[float]:
+    def to_raw_scores(self, scores: Mapping[str, float]) -> list[float]:
         """Convert calibrated scores by class to the network's own scores, in the order of
         `classes`."""
         return [to_raw_score(name, scores[name], self.header.calibration) for name in self.classes]
@@ -112,7 +112,7 @@ class TrainedNetwork:
             torch.cuda.synchronize(self.device)
         return perf_counter()
 
-    def best_scores(self, scores: Iterable[float]) -> tuple[dict[str, float], str | None]:
+    def find_best_scores(self, scores: Iterable[float]) -> tuple[dict[str, float], str | None]:
         """Return the highest scores by class, for a cloud in which none reached its threshold, and
         the problem if one is NaN."""
         best = dict(zip(self.classes, scores))

@@ -20,11 +20,11 @@ from lidar_perception.detectors.pointpillars.targets import (
     IGNORED,
     Targets,
     assign,
-    dense,
     encode,
     find_near_anchors,
     nearest_axis_iou,
-    sparse,
+    to_dense,
+    to_sparse,
 )
 from lidar_perception.geometry import bev_iou
 
@@ -185,8 +185,8 @@ def random_outputs(anchors, clouds=1):
 
 
 def batch(clouds: list[Targets]) -> Targets:
-    return dense([sparse(cloud) for cloud in clouds], clouds[0].labels.shape[1],
-                 torch.device("cpu"))
+    return to_dense([to_sparse(cloud) for cloud in clouds], clouds[0].labels.shape[1],
+                    torch.device("cpu"))
 
 
 def test_sparse_targets_round_trip():

@@ -11,7 +11,7 @@ import torch
 from detection_samples import lively, tiny
 
 from lidar_perception.detectors.checkpoint import Header, read_arrays, save_checkpoint
-from lidar_perception.detectors.layer_weights import LayerWeights, Misfit, to_arrays
+from lidar_perception.detectors.layer_weights import LayerWeights, WeightsMismatch, to_arrays
 from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
@@ -49,7 +49,7 @@ def test_tensors_of_another_network_are_refused(change):
     tensors = to_arrays(lively(config))
     SparseNetwork(config, tensors)
     change(tensors)
-    with pytest.raises(Misfit):
+    with pytest.raises(WeightsMismatch):
         SparseNetwork(config, tensors)
 
 

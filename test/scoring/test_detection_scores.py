@@ -335,7 +335,7 @@ def test_wrong_heights_are_diagnosed(shift, taller, words):
 
 def brute_best(scores):
     """The greatest F1 over every score that occurs."""
-    return max(scores.table(s)["all"]["f1"] for _, _, found in scores.frames for s in found)
+    return max(scores.make_rows(s)["all"]["f1"] for _, _, found in scores.frames for s in found)
 
 
 @given(seeds)
@@ -346,7 +346,8 @@ def test_the_best_score_is_the_best_of_all_scores(seed):
         truth, found = (np.column_stack([rng.uniform(-2, 2, (n, 3)), np.ones((n, 4))])
                         for n in rng.integers(1, 6, 2))
         scores.update(truth, found, rng.integers(0, 3, len(found)) / 2)
-    assert scores.table(scores.best_score())["all"]["f1"] == pytest.approx(brute_best(scores))
+    best = scores.make_rows(scores.find_best_score())["all"]["f1"]
+    assert best == pytest.approx(brute_best(scores))
     assert scores.compute()["of_all"]["all"]["tp"] == sum(
         len(match_centres(found, truth)[0]) for truth, found, _ in scores.frames)
 
@@ -356,7 +357,7 @@ def test_detections_of_equal_score_are_kept_together():
     scores, person, wrong = CentreScores(), np.array([[10.0, 0, 0, 1, 1, 1, 0]]), np.ones((3, 7))
     scores.update(person, person, np.array([0.9]))
     scores.update(person, np.concatenate([person, wrong]), np.full(4, 0.5))
-    assert scores.best_score() == 0.9
+    assert scores.find_best_score() == 0.9
 
 
 def test_pedestrians_by_centre_distance_worked_out_by_hand():

@@ -117,7 +117,7 @@ def test_detections_that_are_not_finite_are_false_positives():
     assert (i.tolist(), j.tolist()) == ([1], [1])
     score = Score()
     score.update(found, truth)
-    everything = score.table()["all"]
+    everything = score.make_rows()["all"]
     assert (everything["tp"], everything["fp"], everything["fn"]) == (1, 2, 1)
 
 
@@ -134,7 +134,7 @@ def test_hits_misses_and_false_positives_add_up(seed, frames):
         score.update(found, truth)
         truths.append(truth)
         found_count += len(found)
-    table = score.table()
+    table = score.make_rows()
     by_range = np.bincount(find_range_bins(np.concatenate(truths)), minlength=len(RANGE_NAMES))
     for name, count in zip(RANGE_NAMES, by_range):
         assert table[name]["tp"] + table[name]["fn"] == count
@@ -154,7 +154,7 @@ def test_a_case_by_hand():
                  boxes([10, 0, 0], [20, 0, 0], [40, 0, 0]))
     score.update(np.zeros((0, 7), np.float32), boxes([5, 0, 0]))
     score.update(boxes([0, -50, 0]).astype(np.float32), np.zeros((0, 7)))
-    table = score.table()
+    table = score.make_rows()
     counts = {name: tuple(row[k] for k in ("tp", "fp", "fn")) for name, row in table.items()}
     assert counts == {"0-15": (1, 0, 1), "15-30": (1, 1, 0), "30-45": (0, 0, 1),
                       "45-60": (0, 1, 0), "60+": (0, 1, 0), "all": (2, 3, 2)}
@@ -170,7 +170,7 @@ def test_a_case_by_hand():
 def test_a_hit_belongs_to_the_range_of_the_true_object():
     score = Score()
     score.update(boxes([15.2, 0, 0]), boxes([14.8, 0, 0]))
-    assert score.table()["0-15"]["tp"] == 1 and score.table()["15-30"]["fp"] == 0
+    assert score.make_rows()["0-15"]["tp"] == 1 and score.make_rows()["15-30"]["fp"] == 0
 
 
 def test_a_range_begins_at_its_lower_limit():
@@ -181,7 +181,7 @@ def test_a_range_begins_at_its_lower_limit():
 
 
 def test_nothing_found_and_nothing_to_find_have_ratios_of_0():
-    empty = Score().table()["all"]
+    empty = Score().make_rows()["all"]
     assert empty == dict(tp=0, fp=0, fn=0, precision=0.0, recall=0.0, f1=0.0, centre_error_m=None)
 
 

@@ -65,7 +65,7 @@ def counted(sequences):
     for frames in sequences:
         kept = [drop_ignored(f) for f in frames]
         hota, clear = hota + count_hota(kept), clear + count_clear(kept)
-    return hota.scores(), clear
+    return hota.compute_scores(), clear
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -20,7 +20,7 @@ from training_toy import STILL, broken_folder, prepare_all
 
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.pointpillars.config import RANGES, make_config
-from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED, dense
+from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED, to_dense
 from lidar_perception.geometry import is_within, wrap_angle
 from lidar_perception.simulation import drive
 from lidar_perception.simulation.camera import make_kitti_labels, turn_camera
@@ -133,7 +133,7 @@ def scene_of_two(**changes) -> TrainingScene:
 
 
 def labels_of(sample: Sample, anchors: torch.Tensor) -> torch.Tensor:
-    return dense([sample.targets], len(anchors), torch.device("cpu")).labels[0]
+    return to_dense([sample.targets], len(anchors), torch.device("cpu")).labels[0]
 
 
 @pytest.mark.parametrize("version", ["v0", "v2", "v4"])

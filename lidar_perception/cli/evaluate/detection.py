@@ -106,7 +106,7 @@ class DetectionRequest:
             content["reliability"] = {name: measure_reliability(comparison, name)
                                       for name in SCORED}
         if self.intervals and report.frames:
-            content["intervals"] = report.intervals(self.intervals)
+            content["intervals"] = report.compute_intervals(self.intervals)
         return content
 
 

@@ -54,7 +54,7 @@ class CompiledPointNet:
         tensors: state_dict of network.make_pointnet(config), by name.
 
     Raises:
-        Misfit: the tensors belong to another network.
+        WeightsMismatch: the tensors belong to another network.
     """
 
     def __init__(self, config: PointNetConfig, tensors: Mapping[str, np.ndarray]):
@@ -63,25 +63,25 @@ class CompiledPointNet:
         weights = LayerWeights(tensors, NORM_EPS)
         shallow, local, wide = (config.point_channels[-1], config.local_channels,
                                 config.global_channels)
-        self.points = _layers(weights, "points", POINT, *config.point_channels)
+        self.points = _take_layers(weights, "points", POINT, *config.point_channels)
         self.raw = self.fine = self.local = self.coarse = None
         found = (shallow + (local if config.groups else 0)) if config.skip else 0
         if config.groups:
             self.local = _Local(config, weights)
-            self.fine = _layers(weights, "fine", local, wide)
+            self.fine = _take_layers(weights, "fine", local, wide)
             found += wide
         if config.mrg:
             self.coarse = _Coarse(config, weights)
             found += wide
         if config.mrg or not config.groups:
-            self.raw = _layers(weights, "raw", shallow, wide)
+            self.raw = _take_layers(weights, "raw", shallow, wide)
             found += wide
-        self.head = _layers(weights, "head", found + CONTEXT, *config.head_channels)
+        self.head = _take_layers(weights, "head", found + CONTEXT, *config.head_channels)
         self.widths = [len(config.classes) + 1, 3, 3, config.yaw_bins, config.yaw_bins]
         outputs = [weights.take(name, (width, config.head_channels[-1])) for name, width in (
             ("classes", self.widths[0]), ("box", sum(self.widths[1:])))]
         weight, bias = map(np.concatenate, zip(*outputs))
-        self.outputs = _layer(weight, bias, relu=False)
+        self.outputs = _make_layer(weight, bias, relu=False)
         self.temperature = weights.array("temperature", (1,))
         self.offsets = weights.array("offsets", (self.widths[0],))
         weights.finish()
@@ -96,37 +96,38 @@ class CompiledPointNet:
         def compute(begin: int, end: int) -> None:
             for first in range(begin, end, CHUNK):
                 rows = slice(first, min(first + CHUNK, end))
-                values[rows] = self._values(inputs.points[rows], inputs.valid[rows],
-                                            inputs.context[rows])
+                values[rows] = self._evaluate(inputs.points[rows], inputs.valid[rows],
+                                              inputs.context[rows])
 
         run_in_parts(compute, len(values), -(-len(values) // CHUNK))
         return Outputs(*np.split(values, [*accumulate(self.widths[:-1])], axis=1))
 
-    def _values(self, points: np.ndarray, valid: np.ndarray, context: np.ndarray) -> np.ndarray:
+    def _evaluate(self, points: np.ndarray, valid: np.ndarray, context: np.ndarray) -> np.ndarray:
         """Return all outputs (K, C) for a few clusters; arguments as in ClusterInput."""
         sizes = valid.sum(axis=1)
         first = np.concatenate([[0], np.cumsum(sizes)])
         rows = np.zeros((first[-1], pad_channels(POINT)), np.float32)
         rows[:, :POINT] = points[valid]
         dense = (sizes / np.float32(self.config.points))[:, None].astype(np.float32)
-        features = _through(self.points, rows)
-        found, shallow = [], [kernels.maxima(features, first, self.points[-1].channels)]
+        features = _apply_layers(self.points, rows)
+        found, shallow = [], [kernels.max_by_group(features, first, self.points[-1].channels)]
         if self.local is not None:
             assert self.fine is not None
             local, first_centre = self.local(rows, first, features, self.config.centroids)
-            fine = _through(self.fine, local)
-            found.append(kernels.maxima(fine, first_centre, self.fine[-1].channels))
-            shallow.append(kernels.maxima(local, first_centre, self.local.join[-1].channels))
+            fine = _apply_layers(self.fine, local)
+            found.append(kernels.max_by_group(fine, first_centre, self.fine[-1].channels))
+            shallow.append(kernels.max_by_group(local, first_centre, self.local.join[-1].channels))
             if self.coarse is not None:
                 coarse = self.coarse(rows, first, local, first_centre, self.config.coarse)
                 found.append(coarse * (np.float32(0.5) + dense))
         if self.raw is not None:
-            raw = kernels.maxima(_through(self.raw, features), first, self.raw[-1].channels)
+            raw = kernels.max_by_group(_apply_layers(self.raw, features), first,
+                                       self.raw[-1].channels)
             found.append(raw * (np.float32(1.5) - dense) if self.config.mrg else raw)
         if self.config.skip:
             found += shallow
-        joined = _side_by_side([*found, context])
-        return self.outputs(_through(self.head, joined))[:, :self.outputs.channels]
+        joined = _concatenate_padded([*found, context])
+        return self.outputs(_apply_layers(self.head, joined))[:, :self.outputs.channels]
 
 
 class _Local:
@@ -137,27 +138,27 @@ class _Local:
         self.in_ball = config.density == "ball"
         radii, counts = zip(*config.groups)
         self.radii, self.counts = np.array(radii, np.float32), np.array(counts)
-        self.nets = [_layers(weights, f"local.nets.{i}", POINT, *config.group_channels)
+        self.nets = [_take_layers(weights, f"local.nets.{i}", POINT, *config.group_channels)
                      for i in range(len(radii))]
-        self.join = _layers(weights, "local.join", len(radii) * config.group_channels[-1]
-                            + self.shallow, config.local_channels)
+        self.join = _take_layers(weights, "local.join", len(radii) * config.group_channels[-1]
+                                 + self.shallow, config.local_channels)
 
     def __call__(self, rows: np.ndarray, first: np.ndarray, features: np.ndarray,
                  most: int) -> tuple[np.ndarray, np.ndarray]:
         """Return features (R, C) of the centres of all clusters, and the first centre of each
         cluster (K + 1,)."""
-        relative, starts, density, first_centre = kernels.grouped(rows, first, most, self.radii,
-                                                                  self.counts, self.in_ball)
+        relative, starts, density, first_centre = kernels.group_neighbours(
+            rows, first, most, self.radii, self.counts, self.in_ball)
         weights = density / density.sum(axis=1, keepdims=True) * np.float32(len(self.counts))
         scales = []
         for s, layers in enumerate(self.nets):
-            values = _through(layers, relative[s, :starts[s, -1]])
-            scales.append(kernels.maxima(values, starts[s], layers[-1].channels)
+            values = _apply_layers(layers, relative[s, :starts[s, -1]])
+            scales.append(kernels.max_by_group(values, starts[s], layers[-1].channels)
                           * weights[:, s:s + 1])
         own = np.repeat(first[:-1] - first_centre[:-1], np.diff(first_centre)) + np.arange(
             first_centre[-1])
         scales.append(features[own, :self.shallow])
-        return _through(self.join, _side_by_side(scales)), first_centre
+        return _apply_layers(self.join, _concatenate_padded(scales)), first_centre
 
 
 class _Coarse:
@@ -165,9 +166,9 @@ class _Coarse:
 
     def __init__(self, config: PointNetConfig, weights: LayerWeights):
         self.radius, self.count = np.float32(config.coarse_radius), config.coarse_neighbours
-        weight, bias = _normed(weights, "coarse.net.0", 3 + config.local_channels,
-                               config.global_channels)
-        self.features = _layer(weight[:, 3:], bias, relu=False)
+        weight, bias = _take_norm_layer(weights, "coarse.net.0", 3 + config.local_channels,
+                                        config.global_channels)
+        self.features = _make_layer(weight[:, 3:], bias, relu=False)
         self.position = np.zeros((3, len(self.features.bias)), np.float32)
         self.position[:, :len(weight)] = weight[:, :3].T
 
@@ -179,29 +180,29 @@ class _Coarse:
         return greatest[:, :self.features.channels]
 
 
-def _layers(weights: LayerWeights, name: str, *channels: int) -> list[Layer]:
+def _take_layers(weights: LayerWeights, name: str, *channels: int) -> list[Layer]:
     """Take the layers of network.mlp(*channels)."""
-    return [_layer(*_normed(weights, f"{name}.{i}", read, out), relu=True)
+    return [_make_layer(*_take_norm_layer(weights, f"{name}.{i}", read, out), relu=True)
             for i, (read, out) in enumerate(pairwise(channels))]
 
 
-def _normed(weights: LayerWeights, name: str, channels: int, out: int) -> Weights:
+def _take_norm_layer(weights: LayerWeights, name: str, channels: int, out: int) -> Weights:
     """Take a network.LinearNormRelu."""
     return weights.take(f"{name}.0", (out, channels), f"{name}.1")
 
 
-def _layer(weight: np.ndarray, bias: np.ndarray | None, relu: bool) -> Layer:
+def _make_layer(weight: np.ndarray, bias: np.ndarray | None, relu: bool) -> Layer:
     values = pack_weights(weight[:, :, None])
     return Layer(values, pad_bias(bias, len(values) * BLOCK), len(weight), relu)
 
 
-def _through(layers: Sequence[Layer], rows: np.ndarray) -> np.ndarray:
+def _apply_layers(layers: Sequence[Layer], rows: np.ndarray) -> np.ndarray:
     for layer in layers:
         rows = layer(rows)
     return rows
 
 
-def _side_by_side(parts: Sequence[np.ndarray]) -> np.ndarray:
+def _concatenate_padded(parts: Sequence[np.ndarray]) -> np.ndarray:
     """Concatenate parts (R, C_i) as (R, C) float32, padded with zeros for the next layer."""
     width = sum(part.shape[1] for part in parts)
     joined = np.zeros((len(parts[0]), pad_channels(width)), np.float32)

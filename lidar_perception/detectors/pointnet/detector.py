@@ -17,7 +17,7 @@ from lidar_perception.detectors.calibration import calibrate_scores
 from lidar_perception.detectors.checkpoint import Header, read_arrays
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.devices import CPU, find_device
-from lidar_perception.detectors.layer_weights import Misfit
+from lidar_perception.detectors.layer_weights import WeightsMismatch
 from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.detectors.normalized_view import (
@@ -96,7 +96,7 @@ class PointNetDetector(NetworkDetector):
         return DetectionResult(detections, timings, problem or self.fallback, best)
 
     def _make_detections(self, predicted: Predictions) -> tuple:
-        """Return the detections, and the result of best_scores."""
+        """Return the detections, and the result of find_best_scores."""
         broken = None
         best: dict[str, float] = {}
         valid = np.isfinite(np.column_stack([predicted.probabilities, predicted.boxes])).all(axis=1)
@@ -106,11 +106,11 @@ class PointNetDetector(NetworkDetector):
         predicted = predicted.take(np.flatnonzero(valid))
         detections = calibrate_scores(
             select_detections(predicted, self.classifier.config,
-                              self.classifier.raw_scores(self.min_scores), self.settings.nms),
+                              self.classifier.to_raw_scores(self.min_scores), self.settings.nms),
             self.classifier.header.calibration)
         if len(detections) == 0 and valid.any():
             highest = predicted.probabilities[:, :len(self.classes)].max(axis=0)
-            best, nan = self.classifier.best_scores(highest.tolist())
+            best, nan = self.classifier.find_best_scores(highest.tolist())
             broken = nan or broken
         return detections, best, broken
 
@@ -168,7 +168,7 @@ def load_pointnet_detector(path: str | Path = "", device: str = "auto",
 def _load_network(path: Path, device: str, engine: str) -> tuple[Header, Network]:
     """Load the network of a checkpoint; with torch only if no compiled kernels can run it."""
     if device == CPU and engine == "auto" and LANES:
-        with suppress(Misfit):  # the torch path reports what does not fit
+        with suppress(WeightsMismatch):  # the torch path reports what does not fit
             header, tensors = read_arrays(path, PointNetConfig)
             return header, CompiledPointNet(header.config, tensors)
     from lidar_perception.detectors.pointnet.network import fuse_norms, load_pointnet

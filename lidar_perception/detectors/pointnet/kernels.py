@@ -13,7 +13,7 @@ from lidar_perception.detectors.matrix_kernel import UNROLL
 
 
 @njit(cache=True, nogil=True)
-def maxima(rows, first, columns):
+def max_by_group(rows, first, columns):
     """Return the maximum of each group of rows over the first `columns` columns, (K, columns)
     float32; NaN if a value is NaN or the group is empty."""
     greatest = np.full((len(first) - 1, columns), np.nan, np.float32)
@@ -28,7 +28,7 @@ def maxima(rows, first, columns):
 
 
 @njit(cache=True, nogil=True)
-def _nearest(points, begin, end, centre, count, distances, indices):
+def _find_nearest(points, begin, end, centre, count, distances, indices):
     """Write the squared distances, ascending, and the indices of the points among begin .. end that
     are nearest to point number `centre`; return their number, at most `count`."""
     found = 0
@@ -62,7 +62,7 @@ def _count_within(points, begin, end, centre, squared_radius):
 
 
 @njit(cache=True, nogil=True)
-def grouped(points, first, most, radii, counts, in_ball):
+def group_neighbours(points, first, most, radii, counts, in_ball):
     """Group points (P, 5 or more) around the first `most` points of each cluster.
 
     Args:
@@ -88,8 +88,8 @@ def grouped(points, first, most, radii, counts, in_ball):
     for k in range(clusters):
         for c in range(first_centre[k], first_centre[k + 1]):
             centre = first[k] + c - first_centre[k]
-            found = _nearest(points, first[k], first[k + 1], centre, counts.max(), distances,
-                             indices)
+            found = _find_nearest(points, first[k], first[k + 1], centre, counts.max(), distances,
+                                  indices)
             for s in range(scales):
                 row, radius = starts[s, c], radii[s]
                 for i in range(min(found, counts[s])):
@@ -128,7 +128,8 @@ def coarse_maxima(points, first, rows, first_row, most, count, radius, weights):
         if size == 0:
             greatest[k] = np.nan
         for centre in range(first[k], first[k] + min(most, size)):
-            found = _nearest(points, first[k], first[k] + size, centre, count, distances, indices)
+            found = _find_nearest(points, first[k], first[k] + size, centre, count, distances,
+                                  indices)
             for i in range(found):
                 if distances[i] > radius * radius:
                     break

@@ -217,6 +217,9 @@ def fuse_norms(network: PointNet) -> PointNet:
 
 def load_pointnet(path: str | Path,
                   expected: PointNetConfig | None = None) -> tuple[Header, PointNet]:
-    """Header and network of a checkpoint, in float32 on the CPU, in training mode. InputError if
-    the file cannot be used, or holds another network than expected."""
+    """Load a checkpoint: header, and network in float32 on the CPU, in training mode.
+
+    Raises:
+        InputError: the file cannot be used, or its config differs from `expected`.
+    """
     return load_checkpoint(path, PointNetConfig, make_pointnet, expected)

@@ -13,7 +13,7 @@ from lidar_perception.detectors.base import NetworkDetector, make_synthetic_fram
 from lidar_perception.detectors.checkpoint import Header, read_arrays, read_header
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.devices import CPU, find_device, uses_16_bits
-from lidar_perception.detectors.layer_weights import Misfit, to_arrays
+from lidar_perception.detectors.layer_weights import WeightsMismatch, to_arrays
 from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.detectors.normalized_view import NormalizedView, restore_detections
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
@@ -160,7 +160,7 @@ def _load_sparse(path: Path) -> tuple[Header, SparseNetwork]:
     try:
         header, tensors = read_arrays(path, NetworkConfig)
         return header, SparseNetwork(header.config, tensors)
-    except Misfit:  # torch names what does not fit, and reads number formats that NumPy lacks
+    except WeightsMismatch:  # torch reads more number formats, and names what does not fit
         from lidar_perception.detectors.pointpillars.network import load_network
         header, network = load_network(path)
         return header, SparseNetwork(header.config, to_arrays(network))

@@ -109,7 +109,7 @@ class PointPillarsProposer(TrainedNetwork):
 
         def work() -> tuple[list[float], DetectionResult]:
             times, predictions = self._predict(inputs)
-            found = self._decode(predictions, self.raw_scores(scores.get_all(self.classes)),
+            found = self._decode(predictions, self.to_raw_scores(scores.get_all(self.classes)),
                                  nms)
             return [begin, *times, self.now()], found
 
@@ -165,7 +165,8 @@ class PointPillarsProposer(TrainedNetwork):
             problem = ("the network returns the same scores everywhere; the weights are broken, "
                        "use other weights")
         elif len(boxes) == 0 and logits:
-            best, problem = self.best_scores(expit(np.concatenate(logits).max(axis=0)).tolist())
+            highest = expit(np.concatenate(logits).max(axis=0))
+            best, problem = self.find_best_scores(highest.tolist())
         detections = apply_nms(boxes, expit(best_logits), labels, self.classes, nms)
         return DetectionResult(calibrate_scores(detections, self.header.calibration),
                                problem=problem, best=best)

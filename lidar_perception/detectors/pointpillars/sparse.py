@@ -79,7 +79,7 @@ class SparseNetwork:
         tensors: state_dict of network.make_network(config), by name.
 
     Raises:
-        Misfit: the tensors belong to another network.
+        WeightsMismatch: the tensors belong to another network.
     """
 
     has_fixed_range = False
@@ -119,8 +119,8 @@ class SparseNetwork:
         def boxes_at(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             rows = features.at(cells[chosen // per_cell])[:, :self.config.fpn_channels]
             numbers = chosen % per_cell
-            return (_outputs_at(self.codes, per_cell, numbers, rows),
-                    _outputs_at(self.directions, per_cell, numbers, rows))
+            return (_evaluate_at(self.codes, per_cell, numbers, rows),
+                    _evaluate_at(self.directions, per_cell, numbers, rows))
 
         return Prediction(logits.reshape(-1, len(self.config.classes)), boxes_at, anchors)
 
@@ -136,28 +136,28 @@ class SparseNetwork:
             Cells (M,) int64 of the head's grid, row by row; the map that the head reads; and
             logits (M, anchors per cell * K) float32.
         """
-        inputs = [self._pillar_map(pillars)]
+        inputs = [self._make_pillar_map(pillars)]
         if self.has_map:
             assert maps is not None
-            inputs.append(_cluster_map(maps[0]))
-        empty = self._empty_maps(pillars.grid)
-        chosen = self._chosen([of.numbers[1:-1, 1:-1] > 0 for of in inputs], reach)
+            inputs.append(_make_cluster_map(maps[0]))
+        empty = self._make_empty_maps(pillars.grid)
+        chosen = self._choose_cells([of.numbers[1:-1, 1:-1] > 0 for of in inputs], reach)
         *_, features, scores = self._run(inputs, chosen, empty)
         logits = scores.rows[len(empty[-1].rows):,
                              :self.config.anchors_per_cell * len(self.config.classes)]
         return np.flatnonzero(chosen[-1]), features, np.ascontiguousarray(logits)
 
-    def _pillar_map(self, pillars: Pillars[np.ndarray]) -> Map:
+    def _make_pillar_map(self, pillars: Pillars[np.ndarray]) -> Map:
         points, offsets, cells = pillars[:3]
         occupied = np.zeros(pillars.grid, bool)
         occupied.ravel()[cells] = True
-        numbers, index = kernels.number_cells(occupied, _blank(pillars.grid), 1)
+        numbers, index = kernels.number_cells(occupied, _make_blank_index(pillars.grid), 1)
         rows = np.zeros((1 + len(numbers), self.pillar_columns), np.float32)
         kernels.pillar_rows(points, offsets, cells, index, self.pillar_weights, self.pillar_bias,
                             rows)
         return Map(index, rows)
 
-    def _chosen(self, occupied: list[np.ndarray], reach: int | None) -> list[np.ndarray]:
+    def _choose_cells(self, occupied: list[np.ndarray], reach: int | None) -> list[np.ndarray]:
         """Return the cells (H, W) bool that each layer has to compute."""
         masks = list(occupied)
         for layer in self.layers:
@@ -184,10 +184,10 @@ class SparseNetwork:
         cloud."""
         maps = list(inputs)
         for layer, mask, background in zip(self.layers, chosen, empty):
-            maps.append(_computed(layer, maps, mask, background))
+            maps.append(_compute_map(layer, maps, mask, background))
         return maps[len(inputs):]
 
-    def _empty_maps(self, grid: Grid) -> list[Map]:
+    def _make_empty_maps(self, grid: Grid) -> list[Map]:
         """Return the maps of all layers for an empty cloud.
 
         Values depend only on the distance to the border, so the layers run on the smallest grid
@@ -207,18 +207,18 @@ class SparseNetwork:
             small_grids = [small] * count
             for layer in self.layers:
                 small_grids.append(layer.grid(small_grids))
-            inputs = [Map(_blank(small), np.zeros((1, width), np.float32))
+            inputs = [Map(_make_blank_index(small), np.zeros((1, width), np.float32))
                       for width in (self.pillar_columns, pad_channels(3))[:count]]
             maps = self._run(inputs, [np.ones(g, bool) for g in small_grids[count:]],
-                             [Map(_blank(g), np.zeros((1, len(layer.bias)), np.float32))
+                             [Map(_make_blank_index(g), np.zeros((1, len(layer.bias)), np.float32))
                               for g, layer in zip(small_grids[count:], self.layers)])
-            self._empty[grid] = [_background(*each) for each in zip(
+            self._empty[grid] = [_enlarge_map(*each) for each in zip(
                 maps, margins[count:], grids[count:])]
         return self._empty[grid]
 
 
-def _outputs_at(layer: Weights, per_cell: int, numbers: np.ndarray, rows: np.ndarray
-                ) -> np.ndarray:
+def _evaluate_at(layer: Weights, per_cell: int, numbers: np.ndarray, rows: np.ndarray
+                 ) -> np.ndarray:
     """Return the outputs (N, C / per_cell) of a layer of the head at anchors number (N,) of their
     cells, from the features (N, B) of these cells."""
     weight = layer.weight.reshape(per_cell, -1, rows.shape[1])[numbers]
@@ -226,21 +226,21 @@ def _outputs_at(layer: Weights, per_cell: int, numbers: np.ndarray, rows: np.nda
     return (weight @ rows[:, :, None])[:, :, 0] + layer.bias.reshape(per_cell, -1)[numbers]
 
 
-def _blank(grid: Grid) -> np.ndarray:
+def _make_blank_index(grid: Grid) -> np.ndarray:
     """Return an index in which all cells refer to row 0."""
     return np.zeros((grid[0] + 2, grid[1] + 2), np.int32)
 
 
-def _cluster_map(maps: np.ndarray) -> Map:
+def _make_cluster_map(maps: np.ndarray) -> Map:
     """Convert cluster maps (3, H, W) uint8 to a Map."""
     occupied = (maps[0] | maps[1] | maps[2]) > 0
-    cells, index = kernels.number_cells(occupied, _blank(occupied.shape), 1)
+    cells, index = kernels.number_cells(occupied, _make_blank_index(occupied.shape), 1)
     rows = np.zeros((1 + len(cells), pad_channels(3)), np.float32)
     rows[1:, :3] = maps.reshape(3, -1)[:, cells].T
     return Map(index, rows)
 
 
-def _computed(layer: Layer, maps: list[Map], chosen: np.ndarray, background: Map) -> Map:
+def _compute_map(layer: Layer, maps: list[Map], chosen: np.ndarray, background: Map) -> Map:
     """Return the map of a layer, computed in the cells `chosen` (H, W) bool."""
     first = len(background.rows)
     cells, index = kernels.number_cells(chosen, background.numbers, first)
@@ -264,17 +264,17 @@ def _computed(layer: Layer, maps: list[Map], chosen: np.ndarray, background: Map
     return Map(index, rows)
 
 
-def _background(of: Map, margin: int, grid: Grid) -> Map:
+def _enlarge_map(of: Map, margin: int, grid: Grid) -> Map:
     """Return the map of an empty cloud on a grid, made from that on a smaller grid."""
-    kept, places = zip(*(_along(size, small - 2, margin)
+    kept, places = zip(*(_find_axis_places(size, small - 2, margin)
                          for size, small in zip(grid, of.numbers.shape)))
     rows = of.rows[of.numbers[1:-1, 1:-1][np.ix_(*kept)]].reshape(-1, of.rows.shape[1])
-    index = _blank(grid)
+    index = _make_blank_index(grid)
     index[1:-1, 1:-1] = 1 + places[0][:, None] * len(kept[1]) + places[1]
     return Map(index, np.concatenate([np.zeros_like(rows[:1]), rows]))
 
 
-def _along(size: int, small: int, margin: int) -> tuple[np.ndarray, np.ndarray]:
+def _find_axis_places(size: int, small: int, margin: int) -> tuple[np.ndarray, np.ndarray]:
     """Return, for one axis, which of `small` cells to keep, and which of these has the value of
     each of `size` cells."""
     if small <= 2 * margin:

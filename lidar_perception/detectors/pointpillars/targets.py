@@ -61,10 +61,10 @@ def encode(boxes: Tensor, anchors: Tensor, offset: float) -> tuple[Tensor, Tenso
         (boxes[:, 2] - anchors[:, 2]) / anchors[:, 5],
         *torch.log(boxes[:, 3:6] / anchors[:, 3:6]).unbind(1),
         boxes[:, 6] - anchors[:, 6]], dim=1)
-    return codes, direction(boxes[:, 6], offset)
+    return codes, find_heading_bin(boxes[:, 6], offset)
 
 
-def direction(yaw: Tensor, offset: float) -> Tensor:
+def find_heading_bin(yaw: Tensor, offset: float) -> Tensor:
     """Return int64 bins: 0 for yaw in [offset, offset + pi), 1 for the other half of the circle."""
     turned = torch.remainder(yaw - offset, 2 * math.pi)
     return (turned >= math.pi).long()
@@ -118,14 +118,14 @@ def find_near_anchors(anchors: Tensor, config: NetworkConfig, boxes: Tensor, ind
     return (first + torch.arange(len(config.yaws), device=anchors.device)).reshape(-1)
 
 
-def sparse(targets: Targets) -> SparseTargets:
+def to_sparse(targets: Targets) -> SparseTargets:
     """Convert the targets of one cloud (B = 1), on the CPU, to SparseTargets."""
     labels = targets.labels[0]
     anchors = torch.nonzero(labels != BACKGROUND)[:, 0]
     return SparseTargets(anchors.numpy(), *(part[0][anchors].numpy() for part in targets))
 
 
-def dense(clouds: Sequence[SparseTargets], anchors: int, device: torch.device) -> Targets:
+def to_dense(clouds: Sequence[SparseTargets], anchors: int, device: torch.device) -> Targets:
     """Convert the SparseTargets of B clouds with `anchors` anchors each to Targets on a device."""
     indices = torch.from_numpy(np.concatenate(
         [cloud.anchors + i * anchors for i, cloud in enumerate(clouds)])).to(device)

@@ -96,7 +96,7 @@ class Evaluator(LidarNode):
             self.result.update(CandidateResult(truth, {s: d.boxes[d.class_ids == PEDESTRIAN]
                                                        for s, d in detections.items()}, {}))
         self.counts.update(scored=self.result.frames, **{
-            f"F1 of {s}": f"{score.table()['all']['f1']:.3f}"
+            f"F1 of {s}": f"{score.make_rows()['all']['f1']:.3f}"
             for s, score in self.result.scores.items()})
         names = {name: objects.frame_id for name, objects in frame.items()}
         self.frame_mismatch = None if len({*names.values()}) == 1 else ", ".join(

@@ -76,7 +76,7 @@ class Score:
         for total, count in zip((self.tp, self.fp, self.fn, self.error), counts):
             total += count
 
-    def table(self) -> dict[str, dict]:
+    def make_rows(self) -> dict[str, dict]:
         """Return tp, fp, fn, precision, recall, f1 and centre_error_m by range name and for "all".
 
         A ratio without cases is 0; centre_error_m is None without hits.

@@ -149,6 +149,6 @@ class CandidateReport:
         """Return the content of the JSON file."""
         return {"frames": self.frames, "ground_truth": int(self.true_by_range.sum()),
                 "ground_truth_by_range": dict(zip(RANGE_NAMES, self.true_by_range.tolist())),
-                **{stage: score.table() for stage, score in self.scores.items()},
+                **{stage: score.make_rows() for stage, score in self.scores.items()},
                 "ms": {step: float(np.median(values)) for step, values in self.times.items()},
                 "skipped": self.skipped}

@@ -32,7 +32,7 @@ class CentreScores:
             self.frames.append((truth, boxes[order], scores[order]))
             self.names.append(name)
 
-    def best_score(self) -> float | None:
+    def find_best_score(self) -> float | None:
         """Return the (highest) score threshold with the best F1, None without detections."""
         each_scores, each_hits = [np.zeros(0)], [np.zeros(0, int)]
         for truth, boxes, found_scores in self.frames:
@@ -49,12 +49,12 @@ class CentreScores:
         last = np.append(scores[1:] < scores[:-1], True)  # equal scores stay together
         return float(scores[last][np.argmax(f1[last])])
 
-    def table(self, min_score: float = -np.inf) -> dict[str, dict]:
+    def make_rows(self, min_score: float = -np.inf) -> dict[str, dict]:
         """Return the table of matching.Score for detections of min_score or more."""
         total = Score()
         for truth, boxes, scores in self.frames:
             total.update(boxes[scores >= min_score], truth)
-        return total.table()
+        return total.make_rows()
 
     def compute_f1_interval(self, min_score: float, count: int, follow: bool = False
                             ) -> list[float] | None:
@@ -74,7 +74,7 @@ class CentreScores:
 
     def compute(self) -> dict:
         """Return the content of the JSON file."""
-        best = self.best_score()
+        best = self.find_best_score()
         return {"frames": len(self.frames), "ground_truth": sum(len(t) for t, _, _ in self.frames),
-                "of_all": self.table(), "best_score": best,
-                "at_best_score": self.table() if best is None else self.table(best)}
+                "of_all": self.make_rows(), "best_score": best,
+                "at_best_score": self.make_rows() if best is None else self.make_rows(best)}

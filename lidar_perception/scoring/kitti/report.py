@@ -92,7 +92,7 @@ class DetectionReport:
                 name, result["ap"][name], result["matched"][name]))]
         return result
 
-    def intervals(self, count: int) -> dict[str, dict[str, list[float] | None]]:
+    def compute_intervals(self, count: int) -> dict[str, dict[str, list[float] | None]]:
         """Return intervals [low, high] of AP (R40, moderate) by class and row of INTERVALS.
 
         They come from `count` draws of the drives, see intervals.py. None without labels.

@@ -91,7 +91,7 @@ def _print_paper(content: dict, console: Console) -> None:
 
 
 def print_intervals(content: dict[str, dict], console: Console) -> None:
-    """Print the intervals of AP that DetectionReport.intervals returns."""
+    """Print the intervals of AP that DetectionReport.compute_intervals returns."""
     table = make_table(f"{INTERVAL_PERCENT} % intervals of AP (R40, moderate), drawn by drive", "",
                        *(TITLES[row] + overlap for row, overlap in zip(
                              INTERVALS, (", relaxed", "", ""))), width=10)

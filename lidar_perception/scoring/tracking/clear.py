@@ -37,7 +37,7 @@ class ClearCounts:
     def __add__(self, other: ClearCounts) -> ClearCounts:
         return ClearCounts(*(a + b for a, b in zip(astuple(self), astuple(other))))
 
-    def scores(self) -> dict[str, float]:
+    def compute_scores(self) -> dict[str, float]:
         """Return MOTA (at most 1, may be negative), MOTP, recall and precision; 0 without cases."""
         objects = max(1, self.tp + self.fn)
         return {"MOTA": (self.tp - self.fp - self.switches) / objects,

@@ -37,7 +37,7 @@ class HotaCounts:
     def __add__(self, other: HotaCounts) -> HotaCounts:
         return HotaCounts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
-    def scores(self) -> dict[str, float]:
+    def compute_scores(self) -> dict[str, float]:
         """Return HOTA, DetA, AssA, DetRe, DetPr and LocA, 0..1, averaged over ALPHAS.
 
         They are 0 without cases.

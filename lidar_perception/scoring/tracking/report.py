@@ -109,7 +109,7 @@ def _score_class(sequences: list[list[Pairs]]) -> dict | None:
         hota, clear = hota + count_hota(frames), clear + count_clear(frames)
     if clear.tp + clear.fn + clear.fp == 0:
         return None
-    return {**hota.scores(), **clear.scores(), **score_over_recall(sequences),
+    return {**hota.compute_scores(), **clear.compute_scores(), **score_over_recall(sequences),
             "labels": clear.tp + clear.fn, "boxes": clear.tp + clear.fp,
             "true_tracks": _count_tracks(counted, "true_ids"),
             "tracks": _count_tracks(counted, "track_ids"),

@@ -37,10 +37,10 @@ from lidar_perception.detectors.pointpillars.targets import (
     SparseTargets,
     Targets,
     assign,
-    dense,
     find_near_anchors,
     nearest_axis_iou,
-    sparse,
+    to_dense,
+    to_sparse,
 )
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.geometry import is_within
@@ -148,7 +148,7 @@ class ScenePreparation:
             raise InputError("a scene has no point in the detection range")
         boxes, labels, counted = self._select_objects(raise_scene(scene, lift[2]), seen.xyz)
         targets = _assign_targets(boxes, labels, counted, self._anchors, self.config)
-        return Sample(inputs.points, inputs.cluster_map, boxes, labels, counted, sparse(targets))
+        return Sample(inputs.points, inputs.cluster_map, boxes, labels, counted, to_sparse(targets))
 
     def _select_objects(self, scene: TrainingScene, xyz: np.ndarray) -> tuple[np.ndarray, ...]:
         low, high = np.array(self.config.low), np.array(self.config.high)
@@ -222,7 +222,7 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
                                     config)
         cluster_maps = [s.cluster_map for s in samples if s.cluster_map is not None]
         maps = torch.from_numpy(np.stack(cluster_maps)).to(device) if cluster_maps else None
-        targets = dense([sample.targets for sample in samples], len(classes), device)
+        targets = to_dense([sample.targets for sample in samples], len(classes), device)
         losses = detection_loss(network(pillars, maps), targets, classes)
         return losses.total, {"classes": losses.classes.detach(), "boxes": losses.boxes.detach(),
                               "directions": losses.directions.detach()}
