@@ -117,6 +117,10 @@ MEASURED = (
     Measured("B Table 6", "gain, time, overhead, parameters", EG, SIM),
     Measured("B Figure 20", "V0 and V4 side by side", EG, SIM),
     Measured("B Sections 1, 5", "V0 and V4 with 10, 25, 50 and 100 % of the labels", EG, SIM),
-    Measured("C Tables 2, 3, Figures 6 to 8", "parameters; segmentation against other clusterings",
-             CLUSTERS, "KITTI or nuScenes"),
+    Measured("C Tables 2, 3, Figures 6, 8", "parameters; segmentation against other clusterings",
+             CLUSTERS.replace("clusters", "clusters-segmentation"), "KITTI or nuScenes"),
+    Measured("C Tables 2 to 6, 8, Figures 6, 8, 10", "all of these; radii, ablation, difficulties, "
+             "fewer points and noise", CLUSTERS, "KITTI, nuScenes, or `sim`"),
+    Measured("C Table 7", "scores of nuScenes with velocities of the tracker", CLUSTERS,
+             "nuScenes, or simulated drives"),
 )

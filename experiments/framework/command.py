@@ -37,6 +37,7 @@ EXPERIMENTS = {  # name -> module:attribute of an Experiment; the first is the d
     "stm-cpa": "experiments.stm_cpa.experiment:STM_CPA",
     "stm-cpa-configurations": "experiments.stm_cpa.configurations:CONFIGURATIONS",
     "clusters": "experiments.clusters.experiment:CLUSTERS",
+    "clusters-segmentation": "experiments.clusters.experiment:SEGMENTATION",
 }
 
 
@@ -74,8 +75,9 @@ def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out
     """Run an experiment of a paper and report each value next to the paper's.
 
     EXPERIMENT is stm-cpa (default: every table of the STM-CPA paper), stm-cpa-configurations
-    (the configurations `paper` and `best`, with and without a labelled seed) or clusters (adaptive
-    clustering and improved PointNet).
+    (the configurations `paper` and `best`, with and without a labelled seed), clusters (adaptive
+    clustering and improved PointNet: every table) or clusters-segmentation (its tables without a
+    network).
 
     FOLDER gets report.html, report.md, report.json, the tables as CSV and the figures as PNG, and
     frames.jsonl with the record of every frame. Trained networks are in models/. Workers of --dask
@@ -85,6 +87,7 @@ def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out
     Examples:
       ./lidar reproduce stm-cpa /data/kitti/object --out report
       ./lidar reproduce stm-cpa-configurations /data/kitti/object --out configurations
+      ./lidar reproduce clusters sim --budget 2 --out clusters
       ./lidar reproduce stm-cpa /nfs/kitti --out report --dask tcp://10.0.0.1:8786
     """
     name, data = _split_words(words, data)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import crowd_folder
 
-from experiments.clusters.experiment import CLUSTERS
+from experiments.clusters.experiment import SEGMENTATION
 from experiments.clusters.range_image import cluster_range_image
 from experiments.clusters.segmentation import COUNTS, count_points, pair_clusters
 from experiments.clusters.segmentation_tables import compute_object_scores, compute_scores
@@ -101,13 +101,13 @@ def frames(tmp_path_factory):
 
 
 def test_report_is_complete_with_and_without_records(frames):
-    records = [CLUSTERS.measure(frames, i) for i in range(2)]
+    records = [SEGMENTATION.measure(frames, i) for i in range(2)]
     for record in records:
         for counts in (*record["methods"].values(), *record["sweeps"].values()):
             named = dict(zip(COUNTS, counts, strict=True))
             assert named["both"] <= min(named["found"], named["true"]) <= named["points"]
     for some in ([], [{"frame": "x", "skipped": "why"}], records):
-        sections = CLUSTERS.make_sections(some)
+        sections = SEGMENTATION.make_sections(some)
         tables = [table for section in sections for table in section.tables]
         assert {"table_2", "table_3", "table_3_objects"} <= {table.name for table in tables}
         for table in tables:
@@ -116,7 +116,7 @@ def test_report_is_complete_with_and_without_records(frames):
 
 def test_frame_without_objects_is_skipped_with_a_reason(frames):
     with pytest.raises(InputError, match="no labels"):
-        CLUSTERS.measure([type(frames[0]).of("x", frames[0].load())], 0)
+        SEGMENTATION.measure([type(frames[0]).of("x", frames[0].load())], 0)
 
 
 def test_paired_p_is_small_only_for_a_steady_difference():

@@ -1,0 +1,128 @@
+"""Detections of the trained networks in one frame (paper C, Section 3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+from zlib import crc32
+
+import numpy as np
+
+from experiments.clusters.networks import COMPARED, name_model
+from experiments.framework.precision import to_record
+from experiments.framework.trained_models import TrainedModel
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.clustering.params import ClusteringParams
+from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.params import MIN_SCORE
+from lidar_perception.detectors.pointnet.detector import PointNetDetector
+from lidar_perception.ground.params import GroundParams
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.scoring.detections import thin_scan
+from lidar_perception.scoring.kitti.camera_objects import to_camera_objects, to_scored_labels
+from lidar_perception.training.augment import blur_ranges
+from lidar_perception.types import Detections, InputError, PointCloud
+
+
+class Change(NamedTuple):
+    """Share of the points that are left, and standard deviation of noise along the beams in
+    metres."""
+
+    share: float = 1.0
+    noise: float = 0.0
+
+
+CHANGES = {"50 %": Change(0.5), "20 %": Change(0.2), "10 %": Change(0.1),
+           "noise 2 cm": Change(noise=0.02), "noise 5 cm": Change(noise=0.05),
+           "noise 10 cm": Change(noise=0.1)}  # of Table 8; the paper gives no amount of noise
+
+
+def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[str, Any]:
+    """Detect the objects of a frame with every network, and with some in changed clouds.
+
+    Returns:
+        - truth: the labels, see framework.precision.to_record
+        - found: name of a model -> detections
+        - changed: change -> name of a model -> detections
+        - detector_ms: name of a model -> duration of ground, clusters and network
+        - changed_ms: change -> name of a model -> the same duration
+
+    Raises:
+        InputError: the frame has no labels.
+    """
+    truth, calibration = frame.truth(), frame.calibration()
+    if truth is None:
+        raise InputError(f"{frame.points or frame.name} has no labels; put them beside the scans")
+
+    def detect(change: Change, names: list[str]) -> tuple[dict[str, Any], dict[str, float]]:
+        cloud = change_cloud(frame.load(), change, frame.name)
+        found = detect_with_all(cloud, {n: models[n].weights for n in names}, frame.sensor_height)
+        return ({name: to_record(to_camera_objects(to_scored_labels(boxes), calibration))
+                 for name, (boxes, _) in found.items()},
+                {name: round(ms, 3) for name, (_, ms) in found.items()})
+
+    compared = [name_model(name, 0) for name in COMPARED if name_model(name, 0) in models]
+    found, times = detect(Change(), [*models])
+    changed = {name: detect(change, compared) for name, change in CHANGES.items()}
+    return {"truth": to_record(to_camera_objects(truth, calibration)), "found": found,
+            "changed": {name: boxes for name, (boxes, _) in changed.items()},
+            "detector_ms": times, "changed_ms": {name: ms for name, (_, ms) in changed.items()}}
+
+
+def detect_with_all(cloud: PointCloud, weights: Mapping[str, Path], height: float
+                    ) -> dict[str, tuple[Detections, float]]:
+    """Run networks on a cloud, whose ground and clusters are computed once for equal parameters.
+
+    Args:
+        weights: Checkpoint of each network, by name.
+        height: Height of the sensor, metres.
+
+    Returns:
+        Detections of each network, and the milliseconds of ground, clusters and network.
+    """
+    detectors = {name: open_network(path, height) for name, path in weights.items()}
+    ground: dict[GroundParams, tuple[np.ndarray, float]] = {}
+    clusters: dict[tuple[GroundParams, ClusteringParams], tuple[np.ndarray, float]] = {}
+    found = {}
+    for name, detector in detectors.items():
+        params = detector.params
+        if params.ground not in ground:
+            ground[params.ground] = _time(segment_ground, cloud, params.ground)
+        own, ground_ms = ground[params.ground]
+        key = params.ground, params.clustering
+        if key not in clusters:
+            clusters[key] = _time(cluster_obstacles, cloud.xyz, own, params.clustering)
+        ids, clusters_ms = clusters[key]
+        result = detector(cloud, ground=own, cluster_ids=ids)
+        found[name] = result.detections, ground_ms + clusters_ms + sum(result.timings.values())
+    return found
+
+
+@lru_cache(maxsize=64)
+def open_network(weights: Path, height: float) -> PointNetDetector:
+    """Open a network that returns detections of any score, as average precision needs."""
+    detector = open_detector(weights, "cpu", sensor_height=height, min_score=MIN_SCORE,
+                             settings={"pointnet.warm_up": False})
+    assert isinstance(detector, PointNetDetector)
+    return detector
+
+
+def change_cloud(cloud: PointCloud, change: Change, name: str) -> PointCloud:
+    """Return a cloud with fewer points or noise; the change depends on the name of the frame."""
+    cloud = thin_scan(cloud, change.share, name)
+    if change.noise == 0.0:
+        return cloud
+    rng = np.random.default_rng(crc32(name.encode()))
+    points = blur_ranges(cloud.points(), 0.0, change.noise, rng)
+    return replace(cloud, xyz=np.ascontiguousarray(points[:, :3]))
+
+
+def _time(function: Callable[..., np.ndarray], *arguments: Any) -> tuple[np.ndarray, float]:
+    start = perf_counter()
+    result = function(*arguments)
+    return result, (perf_counter() - start) * 1e3
