@@ -27,12 +27,13 @@ def test_compilation_is_reported_by_the_outermost_block(report_all, capsys):
     lines = []
     with report_compilation(lines.append), report_compilation(lambda _: pytest.fail("twice")):
         assert njit(lambda x: x + 1)(1) == 2
-    assert lines[0] == compiling.COMPILING and lines[-1].startswith("compiled 1 functions in ")
-    assert lines.count(compiling.COMPILING) == 1
+    assert lines[0] == compiling.COMPILING_MESSAGE
+    assert lines[-1].startswith("compiled 1 functions in ")
+    assert lines.count(compiling.COMPILING_MESSAGE) == 1
     with report_compilation():  # on standard error by default
         njit(lambda x: x + 2)(1)
     captured = capsys.readouterr()
-    assert compiling.COMPILING in captured.err and captured.out == ""
+    assert compiling.COMPILING_MESSAGE in captured.err and captured.out == ""
 
 
 def test_calls_of_compiled_code_are_not_reported(monkeypatch):
@@ -57,7 +58,7 @@ def test_wait_for_another_process_is_reported(report_all, tmp_path, monkeypatch)
 
         with lock_compilation(report):
             pass
-    assert lines[0] == compiling.WAITING and lines[1].startswith("waited ")
+    assert lines[0] == compiling.WAITING_MESSAGE and lines[1].startswith("waited ")
     with lock_compilation(pytest.fail):  # the lock is free
         pass
 
@@ -67,7 +68,7 @@ def test_empty_cache_is_reported_before_anything_is_compiled(cached, monkeypatch
     monkeypatch.setattr(compiling, "_is_cached", lambda: cached)
     lines = []
     with report_compilation(lines.append), report_compilation(whole_detector=True):
-        assert lines == [compiling.COMPILING] * (not cached)
+        assert lines == [compiling.COMPILING_MESSAGE] * (not cached)
 
 
 def test_cache_is_found_where_numba_keeps_it(tmp_path):

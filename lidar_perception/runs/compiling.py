@@ -21,9 +21,9 @@ REPORT_AFTER_S = 1.0      # shorter compilations and waits are not reported
 REPORT_INTERVAL_S = 10.0  # compilation time between two reports
 POLL_INTERVAL_S = 0.1
 
-COMPILING = ("compiling numeric code for this machine, once: about a minute on a free core; the "
-             "result is cached")
-WAITING = "waiting for another process to compile, or to load compiled code"
+COMPILING_MESSAGE = ("compiling numeric code for this machine, once: about a minute on a free "
+                     "core; the result is cached")
+WAITING_MESSAGE = "waiting for another process to compile, or to load compiled code"
 
 
 class _Compilation:
@@ -56,7 +56,7 @@ class _Compilation:
         """Report the start of the compilation, once."""
         if not self.announced:
             self.announced = True
-            self.report(COMPILING)
+            self.report(COMPILING_MESSAGE)
 
     def report_until_finished(self) -> None:
         """Report the progress until the block ends."""
@@ -140,7 +140,7 @@ def compile_meanwhile(code: str, log: Path, report: Callable[[str], object]) -> 
         try:
             yield
             if process.poll() is None:
-                report(f"{COMPILING}; see {log}")
+                report(f"{COMPILING_MESSAGE}; see {log}")
             process.wait()
         finally:
             process.kill()
@@ -162,7 +162,7 @@ def lock_compilation(report: Callable[[str], object]) -> Iterator[None]:
         while not _try_lock(lock):
             sleep(POLL_INTERVAL_S)
             if not reported and perf_counter() - start > REPORT_AFTER_S:
-                report(WAITING)
+                report(WAITING_MESSAGE)
                 reported = True
         if reported:
             report(f"waited {perf_counter() - start:.1f} s for another process to compile")

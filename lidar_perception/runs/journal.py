@@ -1,4 +1,4 @@
-"""Journal of a run over frames, by which a stopped run resumes.
+"""Journal of a run over frames, from which a stopped run resumes.
 
 frames.jsonl has the settings in the first line, then one record per frame and line.
 """
@@ -92,7 +92,7 @@ def open_journal(folder: Path, plan: dict[str, Any], *, force: bool = False,
 
 
 def read_skipped_frames(folder: Path) -> dict[str, str]:
-    """Return name -> reason of the frames that the run in a folder skipped; {} without a run."""
+    """Return why the run in a folder skipped frames, by frame name; {} without a run."""
     with suppress(OSError, ValueError, TypeError):
         lines = (folder / JOURNAL_NAME).read_text(errors="replace").splitlines()[1:]
         records = [json.loads(line) for line in lines if '"skipped"' in line]

@@ -1,6 +1,6 @@
 """Work on many items in several processes, which end with the process that started them.
 
-They end after ctrl-C, after the parent was killed, and when memory runs out.
+This also holds after ctrl-C, after the parent was killed, and when memory runs out.
 """
 
 from __future__ import annotations
@@ -222,7 +222,7 @@ def _send_results(results: SimpleQueue[Any], pipe: Connection) -> None:
 
 @contextmanager
 def _block_interrupts() -> Iterator[None]:
-    """Start processes that never see ctrl-C: the process that started them ends them."""
+    """Block SIGINT, so that processes started here ignore ctrl-C; their parent ends them."""
     resource_tracker.ensure_running()  # if it were started in the block, it would lift it
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from math import cos, sin
@@ -144,21 +145,22 @@ def _touches_trajectory(one, way, radius):
     return False
 
 
-class Room:
-    """The actors of a scene so far; new ones must never touch them."""
+class ActorSet:
+    """Actors of a scene, to which others are admitted if they never touch them."""
 
     def __init__(self, seconds: float, keep_clear: np.ndarray | None = None,
-                 way: Trajectory | None = None, radius: float = 0.0):
+                 trajectory: Trajectory | None = None, radius: float = 0.0):
         """Start without actors.
 
         Args:
             seconds: Duration of the drive.
             keep_clear: (M, 8) footprints to keep clear of.
-            way: Trajectory of a round robot; None without one.
+            trajectory: Trajectory of a round robot; None without one.
             radius: Radius of the robot, m.
         """
         self.seconds = seconds
-        self._way = np.empty((0, 3)) if way is None else way.sampled(seconds, STEP_S)
+        self._path = (np.empty((0, 3)) if trajectory is None
+                      else trajectory.sampled(seconds, STEP_S))
         self._radius = radius
         self.actors: list[Actor] = []
         self._taken, self._reach, self._used = np.empty((64, 8)), np.empty(64), 0
@@ -171,7 +173,7 @@ class Room:
         before = self._used
         for actor in group:
             row, own = actor.footprint, slice(before, self._used)
-            if (_touches_trajectory(row, self._way, self._radius + gap)
+            if (_touches_trajectory(row, self._path, self._radius + gap)
                     or _touches_any(row, self._taken[:before], self._reach, self.seconds, gap)
                     or _touches_any(row, self._taken[own], self._reach[own], self.seconds, 0.0)):
                 self._used = before
@@ -179,6 +181,11 @@ class Room:
             self._take(row)
         self.actors += group
         return True
+
+    def admit_each(self, actors: Iterable[Actor], gap: float = 0.1) -> None:
+        """Add each actor that never comes within gap of others or the robot."""
+        for actor in actors:
+            self.admit(actor, gap=gap)
 
     def add(self, *group: Actor) -> None:
         """Add a group without a check, such as people on a bench."""

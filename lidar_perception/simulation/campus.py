@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidar_perception.simulation import crowd
-from lidar_perception.simulation.actors import Actor, Room, make_prop
+from lidar_perception.simulation.actors import Actor, ActorSet, make_prop
 from lidar_perception.simulation.places import Court, Side, place_against, scatter, space_evenly
 from lidar_perception.simulation.roadside import FRONTS, is_plant, make_clutter
 from lidar_perception.simulation.shapes import furniture, vegetation
@@ -71,42 +71,41 @@ CAMPUS_KINDS = {
 def make_campus(rng: np.random.Generator, kind: CampusKind,
                 people: float) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
     """Make a court with its surroundings, things and people, and a robot's trajectory."""
-    way = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
-    court = Court.around(way.sampled(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2),
+    trajectory = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
+    court = Court.around(trajectory.sampled(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2),
                          np.array([rng.uniform(*kind.right), rng.uniform(*kind.left)]))
     lane = rng.uniform(5.0, 7.0) if rng.random() < kind.lane else 0.0
     ground = _draw_ground(rng, kind, court, lane)
-    room = Room(DRIVE_SECONDS, way=way, radius=ROBOT_RADIUS_M)
+    actors = ActorSet(DRIVE_SECONDS, trajectory=trajectory, radius=ROBOT_RADIUS_M)
     names, shares = list(kind.fronts), list(kind.fronts.values())
     left, _, right, _ = sides = court.sides()
     for side in sides:
         walk = lane + 3.0 if lane and side == right else SHOULDER_M if kind.path else 0.0
         front = {**FRONTS, **CAMPUS_FRONTS}[str(rng.choice(names, p=shares))]
         for thing in front(rng, side._replace(walk=walk)):
-            room.admit(thing, gap=-0.8 if is_plant(thing) else 0.1)
+            actors.admit(thing, gap=-0.8 if is_plant(thing) else 0.1)
     if lane:
-        for actor in _fill_lane(rng, right, lane):
-            room.admit(actor, gap=0.3)
+        actors.admit_each(_fill_lane(rng, right, lane), gap=0.3)
     for side in (left, right):
-        for thing in _furnish_edge(rng, side, kind, kerb=lane > 0 and side == right):
-            room.admit(thing, gap=0.25)
+        actors.admit_each(_furnish_edge(rng, side, kind, kerb=lane > 0 and side == right),
+                          gap=0.25)
         for along in scatter(rng, side.length, kind.seats):
             out = SHOULDER_M if kind.path else -rng.uniform(0.5, 1.5)
             seat, *sitters = crowd.place_bench(rng, side, along, out, people)
-            if room.admit(seat, gap=0.5):
-                room.add(*sitters)
+            if actors.admit(seat, gap=0.5):
+                actors.add(*sitters)
         for along in scatter(rng, side.length, kind.racks):
-            for actor in _place_rack(rng, side, along, SHOULDER_M + 0.5 if kind.path else -1.4):
-                room.admit(actor, gap=0.0)
+            actors.admit_each(_place_rack(
+                rng, side, along, SHOULDER_M + 0.5 if kind.path else -1.4), gap=0.0)
     for first, *others in _place_things(rng, court.inner(1.5), kind, people):
-        if room.admit(first, gap=0.3):
-            room.add(*others)
+        if actors.admit(first, gap=0.3):
+            actors.add(*others)
     for along in scatter(rng, court.floor.length, kind.riders * people):
-        room.admit(court.floor.put(
+        actors.admit(court.floor.put(
             make_cyclist(rng), along, rng.uniform(0.6, max(court.floor.walk - 0.6, 0.7)),
             np.pi * rng.integers(2) + rng.normal(0, 0.03), speed=rng.uniform(2.0, 4.5)), gap=0.2)
-    crowd.fill_court(rng, room, court, people, kind.along, kind.across, kind.standers)
-    return ground, tuple(room.actors), way
+    crowd.fill_court(rng, actors, court, people, kind.along, kind.across, kind.standers)
+    return ground, tuple(actors.actors), trajectory
 
 
 def _draw_ground(rng, kind: CampusKind, court: Court, lane: float) -> Ground:

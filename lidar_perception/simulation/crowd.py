@@ -6,12 +6,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lidar_perception.simulation.actors import Actor, Room
+from lidar_perception.simulation.actors import Actor, ActorSet
 from lidar_perception.simulation.places import Court, Side, scatter
 from lidar_perception.simulation.shapes import furniture
-from lidar_perception.simulation.shapes.people import CARRIED, make_pedestrian, make_sitting_person
+from lidar_perception.simulation.shapes.people import (
+    CARRIED,
+    make_pedestrian,
+    make_sitting_person,
+    make_wheelchair,
+)
 from lidar_perception.simulation.shapes.thing import Thing
-from lidar_perception.simulation.shapes.wheelchairs import make_wheelchair
 
 # Chances of groups of 1, 2, ... people.
 STANDING_CHANCES, WALKING_CHANCES = (0.55, 0.3, 0.1, 0.05), (0.62, 0.3, 0.08)
@@ -48,10 +52,7 @@ def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Act
         if roam:
             low, turn = -3.0, turn + rng.normal(0, 0.6) * (rng.random() < 0.5)
         out = rng.uniform(low, max(side.walk - 0.5, low + 0.5))
-        moves = {"speed": speed}
-        pick = rng.random()
-        if pick < 0.2:
-            moves["start" if pick < 0.1 else "stop"] = rng.uniform(1, 15)
+        moves = _draw_moves(rng, speed, 0.2)
         many = rng.choice([1, 2, 3], p=WALKING_CHANCES)
         yield [side.put(make_person(rng, speed), along + rng.uniform(-0.2, 0.2),
                         out + 0.85 * i, turn, **moves) for i in range(many)]
@@ -64,12 +65,19 @@ def place_strolling(rng, court: Court, rate: float) -> Iterator[list[Actor]]:
     """
     for x, y in court.spots(rng, rate):
         speed, turn = _draw_speed(rng), rng.uniform(-np.pi, np.pi)
-        moves = {"speed": speed}
-        if (pick := rng.random()) < 0.5:
-            moves["start" if pick < 0.25 else "stop"] = rng.uniform(1, 15)
+        moves = _draw_moves(rng, speed, 0.5)
         many = rng.choice([1, 2, 3], p=WALKING_CHANCES)
         yield [Actor(make_person(rng, speed), x - 0.85 * i * np.sin(turn),
                      y + 0.85 * i * np.cos(turn), turn, **moves) for i in range(many)]
+
+
+def _draw_moves(rng, speed: float, chance: float) -> dict[str, float]:
+    """Draw arguments of Actor for a walk that starts or stops on the way with this chance."""
+    moves = {"speed": speed}
+    pick = rng.random()
+    if pick < chance:
+        moves["start" if pick < chance / 2 else "stop"] = rng.uniform(1, 15)
+    return moves
 
 
 def _draw_speed(rng) -> float:
@@ -77,7 +85,7 @@ def _draw_speed(rng) -> float:
     return float(np.clip(rng.normal(1.35, 0.25), 0.6, 2.0) if rng.random() < 0.97 else 2.7)
 
 
-def fill_court(rng, room: Room, court: Court, people: float, along: float, across: float,
+def fill_court(rng, actors: ActorSet, court: Court, people: float, along: float, across: float,
                standers: float) -> None:
     """Add people on foot to a court.
 
@@ -91,7 +99,7 @@ def fill_court(rng, room: Room, court: Court, people: float, along: float, acros
                                      WHEELCHAIR_SHARE * (along + standers) * people),
                    place_strolling(rng, court.inner(0.4), across * people)):
         for group in groups:
-            room.admit(*group)
+            actors.admit(*group)
 
 
 def place_wheelchairs(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
@@ -102,8 +110,9 @@ def place_wheelchairs(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
                         speed=rng.choice((0.0, rng.uniform(0.5, 1.3))))]
 
 
-def place_bench(rng, side: Side, along: float, out: float, people: float) -> list[Actor]:
-    """Return a bench with its back to the outside of a side, and the people on it."""
+def place_bench(rng, side: Side, along: float, out: float, people: float,
+                share: float = 0.25) -> list[Actor]:
+    """Return a bench with its back to the outside of a side, and people on a share of its seats."""
     sitters = [side.put(make_sitting_person(rng, chair=False), along + aside, out, -np.pi / 2)
-               for aside in (-0.45, 0.45) if rng.random() < min(0.25 * people, 0.8)]
+               for aside in (-0.45, 0.45) if rng.random() < min(share * people, 0.8)]
     return [side.put(furniture.make_bench(rng), along, out, -np.pi / 2), *sitters]

@@ -65,7 +65,7 @@ def draw_in_footprint(way, divergence, key):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def merge_hits(one, other, pulse, key):
-    """Return the hit of a beam whose two rays have the hits one and other."""
+    """Merge the hits of the two rays of a beam."""
     if one.solid == other.solid:
         return one
     share = hash_uniform(5, key)  # of the energy on the other hit

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidar_perception.simulation import crowd
-from lidar_perception.simulation.actors import Actor, Room, make_prop
+from lidar_perception.simulation.actors import Actor, ActorSet, make_prop
 from lidar_perception.simulation.places import Court, Side, place_against, space_evenly
 from lidar_perception.simulation.roadside import FRONTS
 from lidar_perception.simulation.shapes import furniture, interiors
@@ -75,29 +75,28 @@ THINGS = (*interiors.PERSON_SIZED, furniture.make_planter, furniture.make_litter
 def make_interior(rng: np.random.Generator, kind: IndoorKind,
                   people: float) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
     """Make a level floor with walls, ceiling, furniture and people, and a robot's trajectory."""
-    way = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
-    room = Room(DRIVE_SECONDS, way=way, radius=ROBOT_RADIUS_M)
-    court = Court.around(way.sampled(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2),
+    trajectory = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
+    actors = ActorSet(DRIVE_SECONDS, trajectory=trajectory, radius=ROBOT_RADIUS_M)
+    court = Court.around(trajectory.sampled(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2),
                          rng.uniform(*kind.wide, 2))
     height = rng.uniform(*kind.height)
     for side in court.sides():
-        room.add(*_build_walls(rng, side, kind, height))
+        actors.add(*_build_walls(rng, side, kind, height))
     for what in kind.fill:
         for first, *others in FILLS[what](rng, court, height, people):
-            if room.admit(first, gap=0.8 if others else 0.3):
-                room.add(*others)
+            if actors.admit(first, gap=0.8 if others else 0.3):
+                actors.add(*others)
     for side in court.sides():
-        for thing in place_against(rng, side, THINGS, kind.at_walls):
-            room.admit(thing, gap=0.05)
+        actors.admit_each(place_against(rng, side, THINGS, kind.at_walls), gap=0.05)
     for x, y in court.inner(0.8).spots(rng, kind.things):
         made = THINGS[rng.integers(len(THINGS))](rng)
-        room.admit(Actor(make_prop(made), x, y, rng.uniform(-np.pi, np.pi)), gap=0.3)
-    crowd.fill_court(rng, room, court, people, kind.along, kind.across, kind.standers)
+        actors.admit(Actor(make_prop(made), x, y, rng.uniform(-np.pi, np.pi)), gap=0.3)
+    crowd.fill_court(rng, actors, court, people, kind.along, kind.across, kind.standers)
     # Last, since it blocks nobody.
     lid = court.inner(-interiors.WALL_THICKNESS_M)
-    room.add(Actor(make_prop(interiors.make_ceiling(rng, lid.x1 - lid.x0, lid.y1 - lid.y0, height)),
-                   *court.centre))
-    return PAVEMENT._replace(sidewalk=rng.uniform(0.2, 0.6)), tuple(room.actors), way
+    ceiling = interiors.make_ceiling(rng, lid.x1 - lid.x0, lid.y1 - lid.y0, height)
+    actors.add(Actor(make_prop(ceiling), *court.centre))
+    return PAVEMENT._replace(sidewalk=rng.uniform(0.2, 0.6)), tuple(actors.actors), trajectory
 
 
 def _build_walls(rng, side: Side, kind: IndoorKind, height: float) -> Iterator[Actor]:

@@ -1,4 +1,4 @@
-"""Lines and rectangles along and in which things are placed."""
+"""Lines and rectangles in which things are placed."""
 
 from __future__ import annotations
 
@@ -14,10 +14,13 @@ from lidar_perception.simulation.solids import compute_extents
 
 
 class Side(NamedTuple):
-    """The line of a curb from x, y along heading, in m and rad.
+    """A line along which things are placed, such as a curb.
 
-    To its left are `walk` metres of sidewalk, then the front. parking: width of the parking strip
-    to its right.
+    Attributes:
+        x, y, heading, length: Start, direction and length, in m and rad.
+        walk: Width of the sidewalk to its left, m.
+        front: Kind of the front beyond the sidewalk, see roadside.FRONTS.
+        parking: Width of the parking strip to its right, m.
     """
 
     x: float

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lidar_perception.simulation.actors import Actor, Room, make_prop
+from lidar_perception.simulation.actors import Actor, ActorSet, make_prop
 from lidar_perception.simulation.places import Side, scatter, space_evenly
 from lidar_perception.simulation.shapes import furniture, vegetation
 from lidar_perception.simulation.shapes.buildings import make_building
@@ -21,16 +21,14 @@ RURAL_CLUTTER = (furniture.make_sign, furniture.make_beacon, furniture.make_boll
                  furniture.make_pole)
 
 
-def furnish(rng: np.random.Generator, street: Street, room: Room) -> None:
+def furnish(rng: np.random.Generator, street: Street, actors: ActorSet) -> None:
     """Add everything that never moves and has no label. Plants may overlap other things."""
     for side in (*street.blocks, *street.arms):
         for thing in FRONTS[side.front](rng, side):
-            room.admit(thing, gap=-0.8 if is_plant(thing) else 0.1)
+            actors.admit(thing, gap=-0.8 if is_plant(thing) else 0.1)
     for side in street.blocks:
-        for thing in _place_furniture(rng, side, street.kind):
-            room.admit(thing, gap=0.3)
-    for thing in _place_islands(rng, street):
-        room.admit(thing, gap=0.3)
+        actors.admit_each(_place_furniture(rng, side, street.kind), gap=0.3)
+    actors.admit_each(_place_islands(rng, street), gap=0.3)
 
 
 def is_plant(actor: Actor) -> bool:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidar_perception.simulation import campus, indoor
-from lidar_perception.simulation.actors import FAR_SIGHT_M, LARGE_M, SIGHT_M, Actor, Room
+from lidar_perception.simulation.actors import FAR_SIGHT_M, LARGE_M, SIGHT_M, Actor, ActorSet
 from lidar_perception.simulation.roadside import furnish
 from lidar_perception.simulation.sensor import Motion
 from lidar_perception.simulation.solids import PART, Solids, compute_hull, place_parts
@@ -103,13 +103,13 @@ class Scene:
 
     ground: Ground
     actors: tuple[Actor, ...]
-    way: Trajectory = Trajectory()
+    trajectory: Trajectory = Trajectory()
     kind: str = ""
     seconds: float = DRIVE_SECONDS
 
     def sensor_pose(self, t: float, sensor_height: float) -> np.ndarray:
         """Return the pose (4, 4) float64 of the sensor in the world after t seconds."""
-        along, pose = self.way.at(t), np.eye(4)
+        along, pose = self.trajectory.at(t), np.eye(4)
         cos, sin = math.cos(along.heading), math.sin(along.heading)
         pose[:2, :2] = (cos, -sin), (sin, cos)
         pose[:3, 3] = (along.x, along.y,
@@ -118,21 +118,21 @@ class Scene:
 
     def at(self, t: float, sensor_height: float) -> SceneMoment:
         """Return the scene after t seconds, for a sensor at this height above the ground in m."""
-        along, pose = self.way.at(t), self.sensor_pose(t, sensor_height)
+        along, pose = self.trajectory.at(t), self.sensor_pose(t, sensor_height)
         sensor, turned = pose[:3, 3].copy(), pose[:3, :3]
         ego = sensor[:2]
         a = self._table
-        way = a["speed"] * np.clip(t - a["start"], 0.0, a["stop"] - a["start"])
-        flat = a["xy"] + a["forward"] * way[:, None]
+        travelled = a["speed"] * np.clip(t - a["start"], 0.0, a["stop"] - a["start"])
+        flat = a["xy"] + a["forward"] * travelled[:, None]
         near = np.flatnonzero(np.hypot(*(flat - ego).T) <= a["sight"])
-        a, way, flat = a[near], way[near], flat[near]
+        a, travelled, flat = a[near], travelled[near], flat[near]
         feet = np.where(np.isnan(a["feet"]), surface_height(self.ground, *flat.T), a["feet"])
         base = (np.column_stack([flat, feet]) - sensor) @ turned
         heading = a["heading"] - along.heading
         speed = np.where((a["start"] <= t) & (t < a["stop"]), a["speed"], 0.0)
-        velocity = self._climbing(a["forward"] * speed[:, None]) @ turned
+        velocity = self._add_climb(a["forward"] * speed[:, None]) @ turned
 
-        made = [self.actors[i].thing.parts(s) for i, s in zip(near.tolist(), way.tolist())]
+        made = [self.actors[i].thing.parts(s) for i, s in zip(near.tolist(), travelled.tolist())]
         whose = np.repeat(np.arange(len(made)), [len(m) for m in made])
         solids = place_parts(_join_parts(made), base[whose], heading[whose], a["track"][whose],
                              velocity[whose])
@@ -140,7 +140,7 @@ class Scene:
         known = np.flatnonzero(a["track"])
         boxes = np.column_stack([base, a["size"], heading])[known]
         boxes[:, 2] += boxes[:, 5] / 2
-        moved = (self._climbing(np.array([along.velocity])) @ turned)[0]
+        moved = (self._add_climb(np.array([along.velocity])) @ turned)[0]
         motion = Motion(tuple(moved.tolist()), along.yaw_rate)
         return SceneMoment(solids, sensor, along.heading, boxes, a["class"][known],
                            a["track"][known], speed[known], motion)
@@ -173,7 +173,7 @@ class Scene:
         table["feet"][fixed] = surface_height(self.ground, *corners).min(axis=1)
         return table
 
-    def _climbing(self, flat: np.ndarray) -> np.ndarray:
+    def _add_climb(self, flat: np.ndarray) -> np.ndarray:
         """Return velocities (n, 3) along the slope of the ground from those in the plane (n, 2)."""
         slope = np.array([self.ground.slope_x, self.ground.slope_y])
         return np.column_stack([flat, flat @ slope])
@@ -228,10 +228,10 @@ def _make_street(rng: np.random.Generator, kind: StreetKind,
     """Make a street along x, on which a car drives at y = 0."""
     street = draw_street(rng, kind, DRIVE_SECONDS)
     ego = [0.0, 0.0, 0.0, *EGO_HALF_SIZE_M, street.speed, 0.0, np.inf]
-    room = Room(DRIVE_SECONDS, np.array([ego]))
-    furnish(rng, street, room)
-    populate(rng, street, room, people)
-    return street.ground, tuple(room.actors), Trajectory(street.speed)
+    actors = ActorSet(DRIVE_SECONDS, np.array([ego]))
+    furnish(rng, street, actors)
+    populate(rng, street, actors, people)
+    return street.ground, tuple(actors.actors), Trajectory(street.speed)
 
 
 class SceneType(NamedTuple):

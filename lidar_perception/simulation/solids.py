@@ -82,9 +82,12 @@ class Solids:
 
 def place_parts(made: np.ndarray, base: np.ndarray, heading: np.ndarray, owner: np.ndarray,
                 velocity: np.ndarray) -> Solids:
-    """Return the solids of parts (P,) PART of things at base (P, 3) with heading (P,) in rad.
+    """Place parts in the frame of the sensor.
 
-    owner (P,) and velocity (P, 3) are copied.
+    Args:
+        made: (P,) PART, parts of one or more things.
+        base, heading: (P, 3) positions in m and (P,) headings in rad of the things.
+        owner, velocity: (P,) and (P, 3), see Solids.
     """
     cos, sin = np.cos(made["yaw"] + heading), np.sin(made["yaw"] + heading)
     down, nose = np.cos(made["pitch"]), np.sin(made["pitch"])

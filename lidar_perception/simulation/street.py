@@ -28,13 +28,13 @@ class StreetKind:
     share: float                      # of the streets, a choice
     fronts: dict[str, float]          # weights of what lines a side, see roadside.py
     lane: tuple[float, float] = (3.0, 3.5)
-    beside: tuple[int, int] = (0, 1)  # how many more lanes in our direction, high excluded
+    extra_lanes: tuple[int, int] = (0, 1)  # how many more lanes in our direction, high excluded
     oncoming: tuple[int, int] = (1, 2)
     rails: float = 0.0                # chance of tram tracks
     cycle: float = 0.0                # chance of a strip for bicycles
     parking: float = 0.0              # chance of parking strips
     across: float = 0.0               # chance that cars park nose to the curb
-    taken: tuple[float, float] = (0.0, 0.6)
+    occupied: tuple[float, float] = (0.0, 0.6)
     walk: tuple[float, float] = (1.6, 3.0)
     curb: float = 0.12
     crossing: tuple[float, float] = (50.0, 120.0)  # from one side street to the next
@@ -60,7 +60,7 @@ STREET_KINDS = {
                               tree=3.0, stands=0.1, walkers=1.3, standers=0.05, seats=0.02,
                               riders=0.3),
     "arterial": StreetKind(0.20, {"verge": 0.8, "facade": 0.1, "wild": 0.1}, lane=(3.2, 3.7),
-                           beside=(0, 2), oncoming=(1, 3), rails=0.4, cycle=0.4, parking=0.15,
+                           extra_lanes=(0, 2), oncoming=(1, 3), rails=0.4, cycle=0.4, parking=0.15,
                            walk=(2.0, 3.5), crossing=(90, 200), speed=(5.0, 14.0), headway=3.0,
                            tree=5.0, walkers=1.3, riders=0.5),
     "country": StreetKind(0.13, {"wild": 1.0}, walk=(0.0, 0.0), curb=0.0, crossing=(150, 400),
@@ -140,7 +140,7 @@ def _draw_lanes(rng, kind: StreetKind, speed: float,
     """Draw the lanes, the ego vehicle's first, and the y of the right and left curbs."""
     width = rng.uniform(*kind.lane)
     lanes, right = [Lane(0.0, 1, speed)], -width / 2
-    for _ in range(rng.integers(*kind.beside)):
+    for _ in range(rng.integers(*kind.extra_lanes)):
         lanes.append(Lane(right - width / 2, 1, _draw_lane_speed(rng, kind)))
         right -= width
     left, use = width / 2, ["road"] * rng.integers(*kind.oncoming)

@@ -45,7 +45,7 @@ class Ground(NamedTuple):
     walk: float = 1e9         # width of the sidewalk beyond each curb; grass beyond
     crossings: tuple[tuple[float, float], ...] = ()  # x intervals of side streets, without a curb
     parking: float = 0.0      # width of the parking strip inside each curb
-    rough: float = 0.0        # greatest height of tufts of grass; PAVED of it on the road
+    rough: float = 0.0        # greatest height of tufts; ROAD_HEIGHT_SHARE of it on the road
     litter: float = 0.0       # greatest height of bumps on sidewalks and parking strips
     road: float = 0.3         # reflectances
     sidewalk: float = 0.4

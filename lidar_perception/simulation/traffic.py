@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lidar_perception.simulation.actors import SIGHT_M, Actor, Room
-from lidar_perception.simulation.crowd import place_standing, place_walking
+from lidar_perception.simulation.actors import SIGHT_M, Actor, ActorSet
+from lidar_perception.simulation.crowd import place_bench, place_standing, place_walking
 from lidar_perception.simulation.places import Side, scatter
 from lidar_perception.simulation.shapes.cyclists import (
     make_bicycle,
@@ -15,7 +15,6 @@ from lidar_perception.simulation.shapes.cyclists import (
     make_motorcycle,
     make_motorcyclist,
 )
-from lidar_perception.simulation.shapes.furniture import make_bench
 from lidar_perception.simulation.shapes.heavy_vehicles import make_bus, make_tram, make_truck
 from lidar_perception.simulation.shapes.people import make_sitting_person
 from lidar_perception.simulation.shapes.thing import Thing, block, disc, make_rigid
@@ -35,30 +34,27 @@ OTHER_VEHICLE = 20  # SemanticKITTI class
 MOTORCYCLIST_SHARE = 0.3  # of the riders at the edges of the road
 
 
-def populate(rng: np.random.Generator, street: Street, room: Room, people: float) -> None:
+def populate(rng: np.random.Generator, street: Street, actors: ActorSet, people: float) -> None:
     """Add all labelled actors, and parked bicycles and motorcycles."""
     kind, blocks = street.kind, street.blocks
     for lane in street.lanes:
-        for group in _queue_vehicles(rng, lane, street, room.seconds):
-            room.admit(*group, gap=0.3)
+        for group in _queue_vehicles(rng, lane, street, actors.seconds):
+            actors.admit(*group, gap=0.3)
     for crossing in street.ground.crossings:
-        for actor in _fill_side_street(rng, crossing, street.ground):
-            room.admit(actor, gap=0.3)
+        actors.admit_each(_fill_side_street(rng, crossing, street.ground), gap=0.3)
     for side, share in [(b, 1.0) for b in blocks] + [(arm, 0.7) for arm in street.arms]:
-        for actor in _park_vehicles(rng, side, share * rng.uniform(*kind.taken)):
-            room.admit(actor)
+        actors.admit_each(_park_vehicles(rng, side, share * rng.uniform(*kind.occupied)))
     for side in blocks:
         for seat, *sitters in _place_seats(rng, side, kind.seats, people):
-            if room.admit(seat, gap=0.4):
-                room.add(*sitters)
-    for actor in _place_riders(rng, street, room.seconds, people):
-        room.admit(actor, gap=0.3)
+            if actors.admit(seat, gap=0.4):
+                actors.add(*sitters)
+    actors.admit_each(_place_riders(rng, street, actors.seconds, people), gap=0.3)
     for side in blocks:
         for group in place_standing(rng, side, kind.standers * people):
-            room.admit(*group)
+            actors.admit(*group)
     for side in (*blocks, *_find_crosswalks(street)):
         for group in place_walking(rng, side, kind.walkers * people, roam=kind.curb < 0.05):
-            room.admit(*group)
+            actors.admit(*group)
 
 
 def _draw_vehicles(rng, use: str) -> list[Thing]:
@@ -174,10 +170,7 @@ def _park_vehicles(rng, side: Side, taken: float) -> Iterator[Actor]:
 def _place_seats(rng, side: Side, rate: float, people: float) -> Iterator[list[Actor]]:
     """Yield benches with their backs to the wall and people on them, and cafe chairs."""
     for along in scatter(rng, side.length, 8 * rate):
-        out, turn = max(side.walk - 0.7, 1.5), -np.pi / 2
-        sitters = [side.put(make_sitting_person(rng, chair=False), along + aside, out, turn)
-                   for aside in (-0.45, 0.45) if rng.random() < min(0.2 * people, 0.8)]
-        yield [side.put(make_bench(rng), along, out, turn), *sitters]
+        yield place_bench(rng, side, along, max(side.walk - 0.7, 1.5), people, 0.2)
     for along in scatter(rng, side.length, rate * people):
         out = side.walk - rng.uniform(0.8, 2.5)
         for aside in rng.uniform((-0.9, 0.5), (-0.5, 0.9)):

@@ -35,7 +35,7 @@ class TrainingScene:
         points: (N, 4) float32, x y z intensity.
         boxes: (M, 7) float64, x y z l w h yaw.
         class_ids: (M,) int into CLASSES.
-        wanted: (M,) bool, False for objects too hidden to be labelled.
+        wanted: (M,) bool, True for objects to detect; False for those too hidden to be labelled.
         around: The labels are all around, not only ahead.
         height: Height of the sensor above the ground in metres.
     """
@@ -232,7 +232,7 @@ def raise_scene(scene: TrainingScene, height: float,
 
 def move_objects(scene: TrainingScene, turn: float, shift: float,
                  rng: np.random.Generator) -> TrainingScene:
-    """Turn and shift each object with its points, unless it touches another or would.
+    """Turn and shift each object with its points, unless it touches another one before or after.
 
     Args:
         turn: Largest angle about the object's centre, rad.

@@ -23,7 +23,7 @@ Content = TypeVar("Content")
 
 
 class CacheError(InputError):
-    """The cache cannot be written, as opposed to a scene that cannot be read."""
+    """Raised if the cache cannot be written; a scene that cannot be read is a plain InputError."""
 
 
 def cache_path(cache: Path | None, *key: Any) -> Path | None:

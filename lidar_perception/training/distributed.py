@@ -1,4 +1,4 @@
-"""Training one network in several processes that torchrun starts; one process is rank 0 of 1."""
+"""Training of one network in several processes that torchrun starts; a single one has rank 0."""
 
 from __future__ import annotations
 

@@ -137,19 +137,6 @@ def _fit_any(hours: float, cores: int, speed: Speed, data: Data, given: Plan,
                    validate_steps=given.validate_steps or max(1, -(-steps // validations)))
 
 
-def shorten_plan(plan: Plan, seconds: float, slowdown: float, speed: Speed, data: Data) -> Plan:
-    """Return the plan with as many steps as fit into the remaining time, in seconds.
-
-    At least MIN_STEPS stay. slowdown: the machine is this many times slower than measured.
-    """
-    steps, validations = training_durations(plan, speed, data)
-    fit = ((1 - RESERVE_SHARE) * seconds / slowdown - validations) / (steps / plan.steps)
-    shortened = min(plan.steps, max(MIN_STEPS, int(fit)))
-    count = -(-plan.steps // plan.validate_steps)
-    return plan if shortened > (1 - RESERVE_SHARE) * plan.steps else replace(
-        plan, steps=shortened, validate_steps=-(-shortened // count))
-
-
 def preparation_duration(plan: Plan, cores: int, speed: Speed) -> float:
     """Return the duration of making all scenes, in seconds."""
     return (speed.scan * (plan.scans + plan.val_scans) + speed.cut * plan.cuts) / cores

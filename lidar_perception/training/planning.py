@@ -20,13 +20,11 @@ from lidar_perception.simulation.sensor import Sensor
 from lidar_perception.training.data import Item, SceneReader
 from lidar_perception.training.distributed import get_world_size
 from lidar_perception.training.plan import (
-    STARTUP_S,
     Data,
     Plan,
     Speed,
     fit_plan,
     preparation_duration,
-    shorten_plan,
     training_durations,
 )
 from lidar_perception.training.request import TrainingRequest
@@ -58,7 +56,7 @@ class Planner:
     speed: Speed | None = None
 
     def make_plan(self, settings: dict[str, Any]) -> PlannedRun:
-        """Measure this machine, and return and report the plan that fits the budget.
+        """Measure this machine, then print and return the plan that fits the budget.
 
         Raises:
             InputError: No scene can be used, the budget is too short, or the disk too small.
@@ -85,34 +83,6 @@ class Planner:
         return Data(has_simulated(sources), has_simulated(held_out), _count_recorded(sources),
                     _count_recorded(held_out), self.params.batch * get_world_size(),
                     self.trainer.max_cuts(self.params))
-
-    def shorten_plan(self, run: PlannedRun, begun: float, hours: float) -> PlannedRun:
-        """Return the plan with fewer steps if the preparation took longer than planned.
-
-        Other work may slow steps and preparation differently, so steps are measured again.
-
-        Args:
-            run: The plan, of which no step is done yet.
-            begun: time.monotonic() at the start of the run.
-            hours: Time budget, from the start on.
-        """
-        _, plan, speed, data = run
-        passed = time.monotonic() - begun
-        slowdown = max(1.0, (passed - STARTUP_S) / preparation_duration(plan, count_cores(), speed))
-
-        def seconds_left() -> float:
-            return begun + 3600 * hours - time.monotonic()
-
-        if shorten_plan(plan, seconds_left(), slowdown, speed, data) == plan:
-            return run
-        now = self.measure_speed(*self.open_few_scenes())
-        step_slowdown = now.step / speed.step if plan.part else now.whole / speed.whole
-        shortened = shorten_plan(plan, seconds_left(), max(1.0, step_slowdown), speed, data)
-        if shortened != plan:
-            errors.print(f"the preparation took {format_duration(passed)}, {slowdown:.1f} times "
-                         f"as long as planned, and a step takes {step_slowdown:.1f} times as long: "
-                         f"{shortened.steps} steps instead of {plan.steps}")
-        return run._replace(plan=shortened)
 
     def apply_plan(self, plan: Plan) -> Any:
         """Return the parameters with the numbers of a plan."""
@@ -150,8 +120,8 @@ class Planner:
         cutting = preparation_duration(replace(plan, scans=0, val_scans=0), count_cores(), speed)
         parts = {"simulating": preparation_duration(plan, count_cores(), speed) - cutting,
                  self.trainer.cutting: cutting, "steps": steps, "validation": validations}
-        errors.print(f"about {format_duration(sum(parts.values()))} on {count_cores()} cores as "
-                     f"busy as now, torch with {torch.get_num_threads()} threads: "
+        errors.print(f"about {format_duration(sum(parts.values()))} on {count_cores()} cores at "
+                     f"their present load, torch with {torch.get_num_threads()} threads: "
                      + ", ".join(f"{name} {format_duration(value)}"
                                  for name, value in parts.items()))
         errors.print(f"cache: {params.data.cache}; an interrupted run continues with --resume")

@@ -29,29 +29,26 @@ from lidar_perception.training.run import Validation
 from lidar_perception.types import InputError
 
 
-def make_record(params: LoopParams, batches: Batches, record: dict[str, Any],
-                about: dict[str, Any]) -> dict[str, Any]:
-    """Return the training section of a checkpoint header.
-
-    Args:
-        params: Parameters of the training.
-        batches: The samples, which know the scenes that could not be used.
-        record: Progress, as the loop passes it to Task.save.
-        about: Description of the data.
-    """
-    return {**about, "seed": params.seed, "steps": record["step"],
-            "seconds": round(record["seconds"]), "steps_skipped": record["skipped"],
-            "scenes_skipped": len(batches.skipped), "batch": params.batch * batches.world,
-            "params": flatten(params), "version": __version__}
-
-
 def make_save(out: Path, config: Any, params: LoopParams, batches: Batches,
               about: dict[str, Any],
               commit: str) -> Callable[[str, nn.Module, dict[str, Any]], None]:
-    """Return the save function of a Task, which writes out/name.safetensors."""
+    """Return the save function of a Task, which writes out/name.safetensors.
+
+    Args:
+        out: Folder of the run.
+        config: Configuration of the network.
+        params: Parameters of the training.
+        batches: The samples.
+        about: Description of the data.
+        commit: Version of the code.
+    """
     def save(name: str, module: nn.Module, record: dict[str, Any]) -> None:
-        header = Header(config, make_record(params, batches, record, about),
-                        round_metrics(record.get("metrics", {})), commit,
+        training = {
+            **about, "seed": params.seed, "steps": record["step"],
+            "seconds": round(record["seconds"]), "steps_skipped": record["skipped"],
+            "scenes_skipped": len(batches.skipped), "batch": params.batch * batches.world,
+            "params": flatten(params), "version": __version__}
+        header = Header(config, training, round_metrics(record.get("metrics", {})), commit,
                         record.get("calibration", {}))
         save_checkpoint(out / f"{name}.safetensors", module, header)
 

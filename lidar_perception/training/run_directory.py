@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -15,7 +17,6 @@ from lidar_perception.runs.files import (
     remove_temporaries,
     write_text,
 )
-from lidar_perception.runs.interrupts import interrupt_on_sigterm
 from lidar_perception.runs.resuming import find_differences, lock_folder
 from lidar_perception.training.distributed import get_rank
 from lidar_perception.training.plan import Data, Plan, Speed
@@ -30,7 +31,7 @@ MAX_RUN_BYTES = 10**6
 
 
 class PlannedRun(NamedTuple):
-    """Content of RUN. settings: everything that a resumed run must have in common."""
+    """A planned run, as in run.json. settings: those that a resumed run must have, too."""
 
     settings: dict[str, Any]
     plan: Plan
@@ -89,7 +90,7 @@ class RunDirectory:
         if get_rank() > 0:
             yield
             return
-        with lock_folder(self.path), interrupt_on_sigterm():
+        with lock_folder(self.path), _interrupt_on_sigterm():
             remove_temporaries(self.path, *WRITTEN)
             for folder in (self.path / SCANS, *(self.path / SCANS).glob("*/")):
                 remove_temporaries(folder, "*.npz")
@@ -120,3 +121,20 @@ class RunDirectory:
             raise InputError(f"{self.path} holds a run with {'; '.join(different[:3])}; resume it "
                              "with the same settings, or give another --out")
         return run
+
+
+@contextmanager
+def _interrupt_on_sigterm() -> Iterator[None]:
+    """Raise KeyboardInterrupt on SIGTERM, as on ctrl-C.
+
+    Only in the main thread, and only if there is no other handler.
+    """
+    if (threading.current_thread() is not threading.main_thread()
+        or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL):
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sized
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from lidar_perception.simulation.drive import longest_drive
 from lidar_perception.simulation.scene import Scenes
@@ -73,10 +71,3 @@ def open_sources(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
         val_sources.append(simulate(FIRST_VALIDATION_SCENE, params.val_scans,
                                     scenes=Scenes(None, params.val_people, scene), around=around))
     return tuple(sources), tuple(val_sources)
-
-
-def describe_data(data: tuple[str, ...], val: tuple[str, ...], stream: Sized,
-                  held_out: tuple[Sized, ...], init: Path | None) -> dict[str, Any]:
-    """Return the description of the scenes for the header of a checkpoint."""
-    return {"data": list(data), "scenes": len(stream), "validation": list(val) or "held out",
-            "validation_scenes": sum(map(len, held_out)), "init": str(init or "")}

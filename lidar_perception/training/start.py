@@ -42,7 +42,6 @@ from lidar_perception.training.request import PACKAGE, TrainingRequest
 from lidar_perception.training.run import Progress
 from lidar_perception.training.run_directory import SCANS, RunDirectory
 from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes
-from lidar_perception.training.sources import describe_data
 from lidar_perception.training.trainer import Cuts, Trainer
 from lidar_perception.types import InputError
 
@@ -81,8 +80,9 @@ def start_training(trainer: Trainer, request: TrainingRequest, params: Any,
     _check_request(request, directory, init)
     if not params.data.cache:
         params = with_values(params, {"data.cache": str(request.out / SCANS)})
-    steps_given = bool(params.steps or params.epochs)
-    hours = request.budget if steps_given else request.budget or DEFAULT_BUDGET_H
+    hours = request.budget
+    if hours is None and not (params.steps or params.epochs):
+        hours = DEFAULT_BUDGET_H
     sensor = find_sensor(params.sensor, params.mount_height)
     settings = _collect_settings(request, params, sensor, init)
     chosen = torch.device(find_device(request.device))
@@ -102,16 +102,12 @@ def start_training(trainer: Trainer, request: TrainingRequest, params: Any,
             with _explain_interrupt():
                 _prepare_scenes(trainer, request, sources, held_out, cuts)
                 trainer.collect_cuts(params, cuts, request.out)
-                if not steps_given and not directory.state_file.exists():
-                    shortened = planner.shorten_plan(run, begun, hours or DEFAULT_BUDGET_H)
-                    if shortened != run:
-                        directory.write_plan(shortened)
         wait_for_all()
-        run = directory.read_plan(settings)
-        params = planner.apply_plan(run.plan)
         stream, validation = trainer.make_streams(params, sources, held_out, cuts, request.out)
         batches = Batches(stream, params.batch, request.jobs, get_rank(), get_world_size())
-        about = {**describe_data(request.data, request.val, stream, held_out, request.init),
+        about = {"data": list(request.data), "scenes": len(stream),
+                 "validation": list(request.val) or "held out",
+                 "validation_scenes": sum(map(len, held_out)), "init": str(request.init or ""),
                  "sensor": _describe_sensor(params, sensor, sources)}
         task = trainer.make_task(params, batches, validation, request.out, device, about, commit,
                                  init)

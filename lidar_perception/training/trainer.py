@@ -43,7 +43,7 @@ class Trainer(Protocol):
         """Return the largest number of scenes to cut."""
 
     def reduced_range(self, params: Any) -> dict[str, Any]:
-        """Return the parameters that restrict training to a quicker part of the range.
+        """Return the parameters that restrict training to a part of the range, which is faster.
 
         Empty if there is no such choice.
         """
@@ -60,7 +60,7 @@ class Trainer(Protocol):
         """Return the objects or clusters to cut from the scenes; nothing is cut yet."""
 
     def collect_cuts(self, params: Any, cuts: Cuts, out: Path) -> None:
-        """Write everything that was cut into out, in the form in which training reads it."""
+        """Write the cut objects or clusters into out, in the form that training reads."""
 
     def make_streams(self, params: Any, sources: Sequence[Any], held_out: Sequence[Any],
                      cuts: Cuts, out: Path) -> tuple[Stream, SceneReader]:
@@ -69,4 +69,15 @@ class Trainer(Protocol):
     def make_task(self, params: Any, batches: Batches, held_out: SceneReader, out: Path,
                   device: torch.device, about: dict[str, Any], commit: str,
                   init: Path | None) -> Task:
-        """Return the task of the training loop."""
+        """Return the task of the training loop.
+
+        Args:
+            params: Parameters of the training, with a plan.
+            batches: Samples to train on.
+            held_out: Scenes to validate on.
+            out: Folder for best.safetensors and last.safetensors.
+            device: Device of the network.
+            about: Description of the data for the header; a resumed run must have the same.
+            commit: Version of the code for the header.
+            init: Checkpoint to start from, see checkpoint.copy_matching_weights.
+        """

@@ -113,38 +113,6 @@ def test_nearest_of_single_casts_equals_joint_cast(motion):
         assert np.array_equal(getattr(hits, name), nearest[name]), name
 
 
-def test_order_of_solids_does_not_matter():
-    made = crowd(7)
-    order = np.random.default_rng(0).permutation(len(made))
-    one, other = (cast_rays(s, Ground(), NO_GROUND, SENSOR, DRIVE)
-                  for s in (made, made.take(order)))
-    assert np.array_equal(one.range, other.range) and np.array_equal(one.reached, other.reached)
-
-
-def test_turned_solids_give_turned_hits():
-    made, shift = crowd(3, moving=False), 77
-    angle = 2 * np.pi * shift / SENSOR.columns
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0],
-                     [0, 0, 1]])
-    turned = replace(made, centre=made.centre @ turn.T, axes=turn @ made.axes)
-    one, other = (cast_rays(s, Ground(), NO_GROUND, SENSOR) for s in (made, turned))
-    assert np.array_equal(np.roll(one.owner, shift, axis=0), other.owner)
-    assert np.allclose(np.roll(one.range, shift, axis=0), other.range, rtol=1e-9)
-
-
-def test_moving_solid_is_hit_at_firing_time():
-    velocity = np.array([10.0, -15.0, 0.0])
-    made = solids(BOX, (-9, 3, 0), (1, 2, 1), velocity=velocity)
-    hits, since = cast_rays(made, Ground(), NO_GROUND, SENSOR), make_rays(SENSOR).since
-    seen = np.flatnonzero((hits.owner == 1).any(axis=1))
-    assert len(seen) > 10
-    for column in seen:
-        there = replace(made, centre=made.centre + velocity * since[column],
-                        velocity=np.zeros((1, 3)))
-        assert np.allclose(hits.range[column],
-                           cast_rays(there, Ground(), NO_GROUND, SENSOR).range[column])
-
-
 def test_wall_is_flat_only_after_compensation():
     wall = solids(BOX, (10, 0, 0), (1, 40, 8))
     exact = replace(SENSOR, range_noise=0.0, dropout=0.0)

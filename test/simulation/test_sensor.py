@@ -147,12 +147,6 @@ def test_rays_turn_and_move_with_the_sensor():
     assert np.allclose(turn.direction[..., 2], still.direction[..., 2])
 
 
-def test_same_seed_same_bytes():
-    one, again, other = (measured(SMALL, 20.0, seed=seed) for seed in (1, 1, 2))
-    assert all(a.tobytes() == b.tobytes() for a, b in zip(one, again))
-    assert one.xyz.tobytes() != other.xyz.tobytes()
-
-
 def test_returns_have_documented_properties():
     sensor = replace(HDL64E, azimuth_step=np.radians(1.0))
     rng = np.random.default_rng(0)
@@ -264,11 +258,6 @@ def test_vehicle_blocks_its_sectors():
 def test_blocked_sector_may_be_whole_turn(start, end, degrees):
     shut = ~replace(SMALL, blocked=((4, start, end),)).open_rays()
     assert (shut[:, 4:].sum(axis=0) == 2 * degrees).all() and not shut[:, :4].any()
-
-
-def test_generic_sensor_is_found_by_name():
-    expected = make_generic_sensor(32, -25.0, 15.0, 0.2, 10.0)
-    assert find_sensor("generic:32,-25,15,0.2,10") == expected
 
 
 @pytest.mark.parametrize("name", ["generic:", "generic:32", "generic:64,-24,2,1e-9,10",

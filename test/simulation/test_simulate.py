@@ -231,16 +231,16 @@ def test_resume_names_every_difference(tmp_path, monkeypatch):
     assert run(out, "kitti", 2, 1, "--force").exit_code == 0
 
 
-@pytest.mark.parametrize("options, said", [
+@pytest.mark.parametrize("options, message", [
     (["--sensor", "hdl65"], "unknown sensor 'hdl65': must be one of hdl-32e"),
     (["--format", "pcap"], "pcap"), (["--frames", "0"], "0 is not in the range"),
     (["--seed", "-1"], "-1 is not in the range"), (["--people", "nan"], "people = nan"),
     (["--people", "101"], "101.0 is not in the range"), (["--streets-of", "201"], "1 .. 200"),
     (["--resume", "--force"], "one of them"), (["--format", "mcap", "--resume"], "with 'convert'")])
-def test_bad_arguments_are_named(tmp_path, options, said):
+def test_bad_arguments_are_named(tmp_path, options, message):
     arguments = ["--out", str(tmp_path / "set"), "--format", "kitti", *options]
     result = CliRunner().invoke(simulate, arguments)
     text = result.output + str(result.exception)
-    assert result.exit_code != 0 and said in text
+    assert result.exit_code != 0 and message in text
     assert isinstance(result.exception, SystemExit | InputError)
     assert not (tmp_path / "set").exists()

@@ -19,7 +19,6 @@ from lidar_perception.training.plan import (
     Speed,
     fit_plan,
     preparation_duration,
-    shorten_plan,
     training_durations,
 )
 from lidar_perception.types import InputError
@@ -74,16 +73,6 @@ def test_given_numbers_are_kept():
     assert made == Plan(30, 7, 30, 5000, 11, False)  # it takes longer than the budget
     assert fit_plan(1.0, 2, SPEED, SIM, Plan(scans=100), epochs=3).steps == 75
     assert fit_plan(1.0, 2, SPEED, SIM, Plan(steps=10)).scans <= 40  # not more than the steps use
-
-
-@given(st.floats(0, 7200), st.floats(1, 20))
-def test_slow_preparation_leaves_steps_that_fit(seconds, slower):
-    made = fit_plan(2.0, 2, SPEED, SIM)
-    left = shorten_plan(made, seconds, slower, SPEED, SIM)
-    assert MIN_STEPS <= left.steps <= made.steps and left.validate_steps <= left.steps
-    assert (left.steps in (MIN_STEPS, made.steps)
-            or slower * sum(training_durations(left, SPEED, SIM)) <= seconds)
-    assert shorten_plan(made, 7000.0, 1.0, SPEED, SIM) == made
 
 
 def test_pace_counts_steps_that_fit_between_validations(monkeypatch):

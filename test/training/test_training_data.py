@@ -29,7 +29,7 @@ from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.training import scenes as scenes_module
 from lidar_perception.training.augment import TrainingScene, raise_scene
 from lidar_perception.training.cut_objects import cut_objects
-from lidar_perception.training.data import Batches, Item, SceneReader, Stream, load_items
+from lidar_perception.training.data import Batches, SceneReader, Stream, load_items
 from lidar_perception.training.frames import open_labelled_frames
 from lidar_perception.training.pointpillars.task import (
     Sample,
@@ -220,14 +220,6 @@ def test_validation_without_camera_keeps_labels_in_range(view):
     seen = is_within(known.boxes, config.low, config.high)
     assert np.array_equal(truth.boxes, known.boxes[seen]) and len(truth.extras) == len(truth)
     assert 0 < len(truth) and (len(truth) < len(known) or view == "around")
-
-
-def test_samples_consist_of_arrays():
-    sample = ScenePreparation(tiny("v4"), STILL)(scene_of_two(), np.random.default_rng(0))
-    values = {**vars(sample), **sample.targets._asdict()}
-    assert values.pop("targets") is sample.targets
-    assert all(isinstance(value, np.ndarray) for value in values.values())
-    assert isinstance(Item(sample).sample, Sample)
 
 
 class Workers:

@@ -15,7 +15,7 @@ DEFAULT_STEP = 0.2  # degrees
 
 
 def make_sensor(m: SensorMeasurement) -> Sensor:
-    """Return the measured sensor, in the orientation in which it is mounted if upside down.
+    """Return the measured sensor, turned over if it is mounted upside down.
 
     Properties that clouds do not show, such as the divergence of the beams, are those of the model
     with the same beams, or the defaults. A sensor without beams becomes a grid of the same view

@@ -1,1 +1,1 @@
-"""Text, pictures and files about a measured sensor."""
+"""Values, warnings and files about a measured sensor."""

@@ -1,4 +1,4 @@
-"""Street furniture, much of it of a person's size.
+"""Street furniture, much of it as large as a person.
 
 Each function returns (P,) PART. Fixed things reach into the ground. Fronts face +x.
 """

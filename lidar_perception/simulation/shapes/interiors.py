@@ -84,7 +84,7 @@ def _opening_parts(rng, x: float, half: float, top: float, height: float) -> lis
 
 
 def _room_parts(rng, x: float, height: float) -> list[tuple]:
-    """Return the walls of a room behind, with one thing in it."""
+    """Return the walls of the room behind, with one piece of furniture."""
     far, tone = rng.uniform(2.5, 6.0), dict(reflectance=rng.uniform(0.4, 0.7))
     wide, deep, high = rng.uniform((0.3, 0.2, 0.7), (0.7, 0.5, 2.0))
     at = rng.uniform(-0.4, 0.4) * x

@@ -1,4 +1,4 @@
-"""Pedestrians who walk or stand, the things they carry, and sitting people."""
+"""Pedestrians who walk or stand, the things they carry, and people who sit or use a wheelchair."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from lidar_perception.simulation.solids import BOX, ELLIPSOID, compute_hull, par
 
 PERSON, OTHER = 30, 99
 CARRIED = ("", "backpack", "bag", "umbrella", "trolley", "pram")
+WHEEL_TRANSMISSION = 0.6  # share of the beams that pass between the spokes of a wheelchair
 
 STANCE = 0.54  # share of a stride with the foot on the ground; 0.6 for real walkers
 MIN_LENGTH_SHARE = 0.3  # shortest box as a share of the height, in KITTI
@@ -273,3 +274,18 @@ def make_sitting_person(rng: np.random.Generator, chair: bool = True) -> Thing:
         rows.append(part(ELLIPSOID, (back + 0.1, 0, seat + 0.45 * trunk), (0.1, 0.1, 0.2),
                          reflectance=coat))
     return make_rigid(parts(rows, PERSON), size, "Person_sitting")
+
+
+def make_wheelchair(rng: np.random.Generator) -> Thing:
+    """Make a person in a wheelchair: a Person_sitting whose box includes the chair."""
+    person = make_sitting_person(rng, chair=False)
+    (length, width, height), radius = person.size, rng.uniform(0.28, 0.32)
+    y, back = width / 2 - 0.03, -length / 2 + 0.3
+    wheels = [disc((back, s * y, radius), radius, 0.02, reflectance=RUBBER,
+                   transmission=WHEEL_TRANSMISSION) for s in (-1, 1)]
+    wheels += [disc((length / 2 - 0.15, s * 0.8 * y, 0.1), 0.1, 0.02, reflectance=RUBBER)
+               for s in (-1, 1)]
+    seat = [block((back - 0.2, -0.9 * y, 0.4), (back + 0.25, 0.9 * y, 0.44), reflectance=METAL),
+            block((back - 0.25, -0.9 * y, 0.44), (back - 0.2, 0.9 * y, 0.9), reflectance=METAL)]
+    made = np.concatenate([person.parts(0.0), parts(wheels + seat, OTHER)])
+    return make_rigid(made, (length, width, height), person.label)

@@ -1,7 +1,6 @@
 """Labelled clusters, cut from scenes by the package's own ground and clustering, with a cache.
 
-Training thus shows the network the errors that it meets later: split and merged objects, and
-background.
+So the network is trained on the errors of the pipeline: split and merged objects, and background.
 """
 
 from __future__ import annotations

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +23,7 @@ from lidar_perception.detectors.pointnet.clusters import (
 )
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.losses import cluster_loss
-from lidar_perception.detectors.pointnet.network import PointNet, make_pointnet
+from lidar_perception.detectors.pointnet.network import PointNet
 from lidar_perception.detectors.pointnet.predict import predict, select_detections
 from lidar_perception.detectors.pointnet.torch_network import TorchPointNet, run_network
 from lidar_perception.geometry import points_in_box
@@ -34,16 +32,10 @@ from lidar_perception.runs.terminal import show_progress
 from lidar_perception.scoring.detections import FrameDetections
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.augment import add_range_noise, distort_intensity, vary_thing
-from lidar_perception.training.data import Batches, SceneReader, load_items
-from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
+from lidar_perception.training.params import ClusterAugmentParams
 from lidar_perception.training.pointnet.cut_scenes import MIN_POINTS_LEFT, CutScene, CutScenes
-from lidar_perception.training.record import (
-    load_initial_weights,
-    make_save,
-    report_skipped,
-    summarize_report,
-)
-from lidar_perception.training.run import Task, Validation
+from lidar_perception.training.record import summarize_report
+from lidar_perception.training.run import Validation
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError
 
 MIN_SCORED_POINTS = 10  # of a cluster that counts in the accuracy
@@ -68,7 +60,7 @@ class ClusterSample:
 
 @dataclass(frozen=True)
 class ClusterPreparation:
-    """Makes a ClusterSample of a scene: draws some of its clusters and augments them.
+    """Preparation of a ClusterSample: some clusters of a scene are drawn and augmented.
 
     Attributes:
         config: Configuration of the network.
@@ -256,36 +248,3 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
     return {**metrics, "accuracy": 100 * float(right.mean()) if len(right) else math.nan,
             "object_accuracy": 100 * float(right[objects].mean()) if objects.any() else math.nan,
             "calibration_error": calibration_error(probabilities, labels[known])}, calibration
-
-
-def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches,
-              validation: SceneReader, out: Path, device: torch.device, about: dict[str, Any],
-              commit: str = "", init: Path | None = None) -> Task[PointNet]:
-    """Return the task of training a network.
-
-    Args:
-        config: Configuration of the network.
-        params: Parameters of the training.
-        batches: Samples to train on.
-        validation: Scenes to validate on.
-        out: Folder for best.safetensors and last.safetensors.
-        device: Device of the network.
-        about: Description of the data for the header; a resumed run must have the same.
-        commit: Version of the code for the header.
-        init: Checkpoint to start from, see checkpoint.copy_matching_weights.
-    """
-    torch.manual_seed(params.seed)
-    network = load_initial_weights(make_pointnet(config), init, PointNetConfig).to(device)
-    scenes: list[ValidationClusters] = []
-
-    def validate(module: PointNet) -> Validation:
-        if not scenes:
-            items = [item for item, in load_items(
-                validation, ([n] for n in range(len(validation))), batches.jobs)]
-            scenes.extend(item.sample for item in items if item.sample is not None)
-            report_skipped([reason for item in items for reason in item.skipped], len(scenes),
-                           set())
-        return validate_network(module, scenes)
-
-    return Task(network, make_loss(config, device), batches, validate,
-                make_save(out, config, params, batches, about, commit), batches.epoch, about)

@@ -13,25 +13,26 @@ import torch
 
 from lidar_perception.detectors.checkpoint import POINTPILLARS, read_network_name
 from lidar_perception.detectors.pointnet.config import PointNetConfig
-from lidar_perception.detectors.pointnet.network import make_pointnet
+from lidar_perception.detectors.pointnet.network import PointNet, make_pointnet
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file as pointpillars_file
 from lidar_perception.detectors.weights_file import require_weights
 from lidar_perception.training.augment import TrainingScene
-from lidar_perception.training.data import Batches, Item, SceneReader, Stream
+from lidar_perception.training.data import Batches, Item, SceneReader, Stream, load_items
 from lidar_perception.training.params import PointNetTraining
 from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes, cut_clusters
 from lidar_perception.training.pointnet.task import (
     ClusterPreparation,
+    ValidationClusters,
     load_validation_clusters,
     make_loss,
-    make_task,
     validate_network,
 )
+from lidar_perception.training.record import load_initial_weights, make_save, report_skipped
 from lidar_perception.training.request import PACKAGE
-from lidar_perception.training.run import Task
+from lidar_perception.training.run import Task, Validation
 from lidar_perception.training.timing import (
     find_readable_frame,
     measure_duration,
@@ -60,14 +61,13 @@ def find_proposer(params: PointNetTraining) -> Path | None:
 
 @dataclass(frozen=True)
 class PointNetTrainer:
-    """Trainer of a PointNet of a configuration; the methods are described in Trainer."""
+    """Trainer of the PointNet in one configuration; see Trainer for the methods."""
 
     config: PointNetConfig
     cutting: str = "cutting clusters"
 
     @property
     def name(self) -> str:
-        """Name of the network in messages."""
         return f"PointNet {self.config.title}".strip()
 
     def packaged_weights(self, params: PointNetTraining) -> Path:
@@ -75,7 +75,7 @@ class PointNetTrainer:
         return weights_file(PointNetParams())
 
     def max_cuts(self, params: PointNetTraining) -> int:
-        """Return a number beyond every data set, as all scenes are cut."""
+        """Return a number larger than any data set, since all scenes are cut."""
         return 10**9
 
     def reduced_range(self, params: PointNetTraining) -> dict[str, Any]:
@@ -124,7 +124,6 @@ class PointNetTrainer:
     def make_streams(self, params: PointNetTraining, sources: Sequence[Any],
                      held_out: Sequence[Any], cuts: Cuts,
                      out: Path) -> tuple[Stream, SceneReader]:
-        """Return the clusters to train on and to validate on."""
         training, validation = cuts.sources[:len(sources)], cuts.sources[len(sources):]
         prepare = ClusterPreparation(self.config, params.augment, bool(params.proposer))
         return (Stream(tuple(training), prepare, params.seed),
@@ -133,5 +132,19 @@ class PointNetTrainer:
     def make_task(self, params: PointNetTraining, batches: Batches, held_out: SceneReader,
                   out: Path, device: torch.device, about: dict[str, Any], commit: str,
                   init: Path | None) -> Task:
-        """Return the task of the training loop."""
-        return make_task(self.config, params, batches, held_out, out, device, about, commit, init)
+        torch.manual_seed(params.seed)
+        network = load_initial_weights(make_pointnet(self.config), init, PointNetConfig).to(device)
+        scenes: list[ValidationClusters] = []
+
+        def validate(module: PointNet) -> Validation:
+            if not scenes:
+                items = [item for item, in load_items(
+                    held_out, ([n] for n in range(len(held_out))), batches.jobs)]
+                scenes.extend(item.sample for item in items if item.sample is not None)
+                report_skipped([reason for item in items for reason in item.skipped], len(scenes),
+                               set())
+            return validate_network(module, scenes)
+
+        return Task(network, make_loss(self.config, device), batches, validate,
+                    make_save(out, self.config, params, batches, about, commit), batches.epoch,
+                    about)

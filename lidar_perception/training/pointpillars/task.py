@@ -14,23 +14,15 @@ from torch import Tensor, nn
 
 from lidar_perception.classes import DONT_CARE
 from lidar_perception.data.frame import Frame
-from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.normalized_view import NormalizedView
 from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
-from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
 from lidar_perception.detectors.pointpillars.expert import make_network_input
 from lidar_perception.detectors.pointpillars.losses import detection_loss
-from lidar_perception.detectors.pointpillars.network import (
-    PointPillars,
-    channels_last,
-    make_network,
-)
 from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
 from lidar_perception.detectors.pointpillars.pillar_batch import make_pillar_batch
-from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
 from lidar_perception.detectors.pointpillars.targets import (
     BACKGROUND,
     IGNORED,
@@ -42,7 +34,6 @@ from lidar_perception.detectors.pointpillars.targets import (
     to_dense,
     to_sparse,
 )
-from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.geometry import is_within
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import show_progress
@@ -55,17 +46,10 @@ from lidar_perception.training.augment import (
     raise_scene,
     turn_and_crop,
 )
-from lidar_perception.training.data import Batches, SceneReader, load_items
+from lidar_perception.training.data import SceneReader, load_items
 from lidar_perception.training.database import Database, paste_objects
-from lidar_perception.training.params import AugmentParams, PointPillarsTraining
+from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pasting import find_points_in_box
-from lidar_perception.training.record import (
-    load_initial_weights,
-    make_save,
-    report_skipped,
-    summarize_report,
-)
-from lidar_perception.training.run import Task, Validation
 from lidar_perception.types import (
     CLASSES,
     SENSOR_HEIGHT,
@@ -107,7 +91,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class ScenePreparation:
-    """Makes a Sample of a scene: augmented, cropped to the detection range, with expert columns.
+    """Preparation of a Sample: a scene is augmented, cropped, and gets expert columns.
 
     Attributes:
         config: Configuration of the network.
@@ -266,37 +250,3 @@ def detect_in_frame(frame: Frame, detector: Detector) -> FrameDetections[Detecti
     if height != SENSOR_HEIGHT:
         detector = detector.with_sensor_height(height)
     return run_detector(detector, frame, frame.truth(), frame.calibration())
-
-
-def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batches,
-              validation: SceneReader, out: Path, device: torch.device, about: dict[str, Any],
-              commit: str = "", init: Path | None = None) -> Task[PointPillars]:
-    """Return the task of training a network.
-
-    Args:
-        config: Configuration of the network.
-        params: Parameters of the training.
-        batches: Samples to train on.
-        validation: Scenes to validate on.
-        out: Folder for best.safetensors and last.safetensors.
-        device: Device of the network.
-        about: Description of the data for the header; a resumed run must have the same.
-        commit: Version of the code for the header.
-        init: Checkpoint to start from, see checkpoint.copy_matching_weights.
-    """
-    torch.manual_seed(params.seed)
-    network = load_initial_weights(make_network(config), init, NetworkConfig)
-    network = channels_last(network.to(device))
-    reported: set[str] = set()
-
-    def validate(module: PointPillars) -> Validation:
-        proposer = PointPillarsProposer(TorchNetwork(module, str(device)), Header(config),
-                                        str(device))
-        detector = PointPillarsDetector(proposer, VALIDATION_PARAMS)
-        report = validate_detector(detector, validation, batches.jobs)
-        report_skipped(report.skipped, len(report.frames), reported)
-        return summarize_report(report, params.score, config.classes)
-
-    reduced = reduce_range(config, params.ahead, params.aside)
-    return Task(network, make_loss(reduced, device), batches, validate,
-                make_save(out, config, params, batches, about, commit), batches.epoch, about)

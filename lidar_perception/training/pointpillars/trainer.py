@@ -16,7 +16,11 @@ import torch
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
-from lidar_perception.detectors.pointpillars.network import channels_last, make_network
+from lidar_perception.detectors.pointpillars.network import (
+    PointPillars,
+    channels_last,
+    make_network,
+)
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
@@ -31,10 +35,16 @@ from lidar_perception.training.pointpillars.task import (
     detect_in_frame,
     load_validation_frame,
     make_loss,
-    make_task,
     reduce_range,
+    validate_detector,
 )
-from lidar_perception.training.run import Task
+from lidar_perception.training.record import (
+    load_initial_weights,
+    make_save,
+    report_skipped,
+    summarize_report,
+)
+from lidar_perception.training.run import Task, Validation
 from lidar_perception.training.timing import (
     find_readable_frame,
     measure_duration,
@@ -51,14 +61,13 @@ REDUCED_RANGES = {"ahead": (46.08, 23.04), "around": (30.72, 30.72)}
 
 @dataclass(frozen=True)
 class PointPillarsTrainer:
-    """Trainer of a PointPillars of a configuration; the methods are described in Trainer."""
+    """Trainer of PointPillars in one configuration; see Trainer for the methods."""
 
     config: NetworkConfig
     cutting: str = "cutting objects"
 
     @property
     def name(self) -> str:
-        """Name of the network in messages."""
         return f"PointPillars {self.config.title}"
 
     def packaged_weights(self, params: PointPillarsTraining) -> Path:
@@ -100,9 +109,7 @@ class PointPillarsTrainer:
             step = measure_step(network, make_loss(reduced, device), lambda: [
                 prepare_pasted(scene, np.random.default_rng(0)) for scene in chosen],
                                 params, device)
-        proposer = PointPillarsProposer(TorchNetwork(network, str(device)), Header(self.config),
-                                        str(device))
-        detector = PointPillarsDetector(proposer, VALIDATION_PARAMS)
+        detector = self._make_detector(network, device)
         frame = find_readable_frame(self._make_reader(held_out), lambda frame: detect_in_frame(
             frame, detector).problem is None)
         whole = step * np.prod(self.config.grid) / np.prod(reduced.grid)
@@ -135,7 +142,6 @@ class PointPillarsTrainer:
     def make_streams(self, params: PointPillarsTraining, sources: Sequence[Any],
                      held_out: Sequence[Any], cuts: Cuts,
                      out: Path) -> tuple[Stream, SceneReader]:
-        """Return the scenes to train on and to validate on."""
         prepare = ScenePreparation(
             reduce_range(self.config, params.ahead, params.aside), params.augment,
             params.data.min_points, out / OBJECTS if self.max_cuts(params) else None)
@@ -144,8 +150,26 @@ class PointPillarsTrainer:
     def make_task(self, params: PointPillarsTraining, batches: Batches, held_out: SceneReader,
                   out: Path, device: torch.device, about: dict[str, Any], commit: str,
                   init: Path | None) -> Task:
-        """Return the task of the training loop."""
-        return make_task(self.config, params, batches, held_out, out, device, about, commit, init)
+        torch.manual_seed(params.seed)
+        network = load_initial_weights(make_network(self.config), init, NetworkConfig)
+        network = channels_last(network.to(device))
+        reported: set[str] = set()
+
+        def validate(module: PointPillars) -> Validation:
+            detector = self._make_detector(module, device)
+            report = validate_detector(detector, held_out, batches.jobs)
+            report_skipped(report.skipped, len(report.frames), reported)
+            return summarize_report(report, params.score, self.config.classes)
+
+        reduced = reduce_range(self.config, params.ahead, params.aside)
+        return Task(network, make_loss(reduced, device), batches, validate,
+                    make_save(out, self.config, params, batches, about, commit), batches.epoch,
+                    about)
+
+    def _make_detector(self, network: PointPillars, device: torch.device) -> PointPillarsDetector:
+        proposer = PointPillarsProposer(TorchNetwork(network, str(device)), Header(self.config),
+                                        str(device))
+        return PointPillarsDetector(proposer, VALIDATION_PARAMS)
 
     def _make_reader(self, held_out: Sequence[Any]) -> SceneReader:
         return SceneReader(tuple(held_out), partial(load_validation_frame, self.config))
