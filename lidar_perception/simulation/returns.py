@@ -52,10 +52,6 @@ def make_returns(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Gene
     that of a surface of brightness 0.1 that faces the sensor at sensor.reach.
 
     Args:
-        hits: Hits of all rays.
-        sensor: The sensor.
-        motion: Motion of the sensor.
-        rng: Random generator.
         compensated: Points are in the frame at the stamp, as KITTI publishes them; otherwise as if
             the sensor had not moved.
     """

@@ -54,7 +54,6 @@ def draw_trajectory(rng: np.random.Generator, speed: tuple[float, float], stands
     """Draw a trajectory that stands still or sways in 8 to 25 s.
 
     Args:
-        rng: Random generator.
         speed: Range of the speed, m/s.
         stands: Probability of standing still.
         turn: Largest heading to both sides, rad.

@@ -200,7 +200,6 @@ def blur_ranges(points: np.ndarray, beam: float, point: float,
     means of its beams by 0.035 to 0.07 m. A simulated pole has no such scatter.
 
     Args:
-        points: (N, 4) points.
         beam: Standard deviation in metres of the error that all points of an elevation share.
         point: Standard deviation in metres of each point's own error.
     """

@@ -108,8 +108,6 @@ def fill_cache(sources: Sequence[Any], numbers: Sequence[Sequence[int]], jobs: i
     Args:
         sources: Sources with path(i) and keep(i).
         numbers: Scene numbers of each source.
-        jobs: Number of processes.
-        title: Title of the progress bar.
 
     Raises:
         CacheError: A file cannot be written.

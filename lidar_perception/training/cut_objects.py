@@ -38,8 +38,6 @@ class CutObjects:
     """A source whose scene(i) is the Database of objects cut from scene i, see cut_objects.
 
     Attributes:
-        scenes: Source of scenes.
-        classes: Names of the classes to cut.
         min_points: Objects with fewer points are left out.
         cache: Folder that keeps the objects, or None.
     """
@@ -110,7 +108,6 @@ def find_things(scene: TrainingScene, min_points: int,
     """Find clusters that resemble a standing person and touch no labelled box.
 
     Args:
-        scene: The scene.
         min_points: Smallest number of points of a thing.
         rng: Draws MAX_THINGS if there are more.
 

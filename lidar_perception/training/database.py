@@ -73,7 +73,7 @@ class Database:
 
 def paste_objects(scene: TrainingScene, database: Database, params: AugmentParams,
                   low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> TrainingScene:
-    """Paste objects into a scene until it has as many of each class as params say.
+    """Paste objects into a scene until it has the number of each class that params give.
 
     At most MAX_TRIES objects are tried for each missing one. An object keeps its distance from the
     sensor and is put on the ground, in a random direction in which its centre is between low and
@@ -81,11 +81,8 @@ def paste_objects(scene: TrainingScene, database: Database, params: AugmentParam
     or have no ground. Points in its box and in its shadow are dropped.
 
     Args:
-        scene: The scene.
         database: Objects, and background things, which get no box.
-        params: Wanted numbers.
         low, high: (2 or more,) region of the centres, metres.
-        rng: Random generator.
     """
     points, boxes = scene.points, scene.boxes
     class_ids = []

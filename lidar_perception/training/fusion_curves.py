@@ -104,8 +104,6 @@ def fit_fusion(weights: Path | None, classifier: Path | None, out: Path, params:
         weights: Checkpoint of PointPillars; None for the packaged one.
         classifier: Checkpoint of the PointNet; None for the packaged one.
         out: File to write, see detectors/fused/fusion.py.
-        params: Scans to simulate.
-        jobs: Number of processes.
 
     Returns:
         The fit of each class.

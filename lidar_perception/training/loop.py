@@ -49,11 +49,8 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
     CPU, whether the run was interrupted or not.
 
     Args:
-        task: The network and its data.
-        params: Parameters of the loop.
         out: Folder of the run. Gets the state for resuming, log.csv, validation.csv, and what
             task.save writes.
-        device: Device of the network.
         resume: Continue the run in out; without one there, begin one.
         until: time.monotonic() at which to stop, the last validation included.
         validation: Expected duration of the first validation, in seconds.

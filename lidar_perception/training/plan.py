@@ -79,16 +79,12 @@ class Data:
 
 def fit_plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(),
              epochs: float = 0.0) -> Plan:
-    """Return the plan that uses a time budget best.
+    """Return the plan that makes the best use of a time budget.
 
     It has as many scans as can be seen four times, in at most a quarter of the time. The steps get
     the time that scans and validations leave.
 
     Args:
-        hours: Time budget.
-        cores: Processor cores.
-        speed: Measured durations.
-        data: Available scenes.
         given: Numbers that are fixed where not 0, even if they exceed the budget; part=False
             rules out the reduced range.
         epochs: Fixed passes over the data, 0 for none.

@@ -33,14 +33,6 @@ def make_save(out: Path, config: Any, params: LoopParams, batches: Batches,
               about: dict[str, Any],
               commit: str) -> Callable[[str, nn.Module, dict[str, Any]], None]:
     """Return the save function of a Task, which writes out/name.safetensors.
-
-    Args:
-        out: Folder of the run.
-        config: Configuration of the network.
-        params: Parameters of the training.
-        batches: The samples.
-        about: Description of the data.
-        commit: Version of the code.
     """
     def save(name: str, module: nn.Module, record: dict[str, Any]) -> None:
         training = {
@@ -68,7 +60,6 @@ def report_skipped(skipped: Sequence[str], left: int, reported: set[str]) -> Non
     """Print why validation frames were skipped, and add the reasons to those already reported.
 
     Args:
-        skipped: Reasons.
         left: Number of frames that remain.
         reported: Reasons that were printed before.
 

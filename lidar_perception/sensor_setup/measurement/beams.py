@@ -267,8 +267,6 @@ def measure_range_noise(scans: Sequence[Scan], beams: Beams, step: float) -> flo
     surfaces scatter more, so the peak of the distribution counts.
 
     Args:
-        scans: The scans.
-        beams: Their beams.
         step: Azimuth step in degrees.
     """
     n = PIECE_POINTS

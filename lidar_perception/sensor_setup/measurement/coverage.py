@@ -100,8 +100,6 @@ def measure_coverage(scans: Sequence[Scan], nearest: NearestReturns, mount: Moun
     """Measure the coverage of all scans together.
 
     Args:
-        scans: The scans.
-        nearest: Their nearest returns.
         mount: Mount of the sensor; None if unknown.
         still: The robot stands still; None if unknown.
     """

@@ -165,7 +165,6 @@ def measure_sensor(scans: Sequence[Scan], numbers: Sequence[int], source: str, t
     """Measure a sensor and its mounting.
 
     Args:
-        scans: Scans of the sensor.
         numbers: Their numbers in the recording.
         source: Name of the recording.
         total: Number of clouds in the recording.

@@ -1,4 +1,4 @@
-"""Clouds in the driver's own form, and the meaning of their columns."""
+"""Clouds in the driver's format, and the meaning of their columns."""
 
 from __future__ import annotations
 

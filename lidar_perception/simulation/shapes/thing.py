@@ -29,7 +29,7 @@ SIZES = {
 
 
 class Thing(NamedTuple):
-    """A thing that KITTI labels. Mirrors, and things that a person pushes, may exceed its box.
+    """A thing that KITTI labels. Mirrors and pushed objects may extend beyond its box.
 
     Attributes:
         parts: parts(metres travelled) -> (P,) PART.

@@ -64,8 +64,6 @@ class CutScenes:
     """A source whose scene(i) is the CutScene of scene i, see cut_clusters.
 
     Attributes:
-        scenes: Source of scenes.
-        config: Configuration of the network.
         min_points: Clusters with fewer points are left out.
         cache: Folder that keeps the clusters, or None.
         proposer: PointPillars checkpoint whose wrong proposals become decoys, or None.
@@ -128,8 +126,6 @@ def cut_clusters(scene: TrainingScene, config: PointNetConfig, min_points: int,
     points in a detector's boxes. Clusters of objects that are not wanted are UNKNOWN.
 
     Args:
-        scene: The scene.
-        config: Configuration of the network.
         min_points: Clusters with fewer points are left out.
         proposer: PointPillars checkpoint, some of whose wrong proposals become decoys.
     """

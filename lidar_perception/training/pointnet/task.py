@@ -63,7 +63,6 @@ class ClusterPreparation:
     """Preparation of a ClusterSample: some clusters of a scene are drawn and augmented.
 
     Attributes:
-        config: Configuration of the network.
         augment: Numbers of clusters, and limits of the changes.
         with_decoys: Half of the background consists of decoys, if there are enough.
     """
@@ -116,11 +115,8 @@ def augment_clusters(clusters: Clusters, boxes: np.ndarray, loose: np.ndarray,
     with as many points as the sensor would see there. Loose clusters are cut at a shifted box.
 
     Args:
-        clusters: K clusters.
         boxes: (K, 7) boxes.
         loose: (K,) bool, see CutScene.
-        params: Limits of the changes.
-        rng: Random generator.
 
     Returns:
         The changed clusters and boxes.

@@ -94,7 +94,6 @@ class ScenePreparation:
     """Preparation of a Sample: a scene is augmented, cropped, and gets expert columns.
 
     Attributes:
-        config: Configuration of the network.
         augment: Limits of the changes.
         min_points: Objects with fewer points need not be found.
         database: File of objects to paste, or None.
@@ -156,7 +155,6 @@ def reduce_range(config: NetworkConfig, ahead: float, aside: float) -> NetworkCo
     """Return the config with a shorter detection range, rounded up to whole cells.
 
     Args:
-        config: Configuration of a network.
         ahead: Range ahead, and behind if the config covers that, in metres; 0 keeps it.
         aside: Range to each side in metres; 0 keeps it.
     """
