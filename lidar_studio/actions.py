@@ -218,7 +218,7 @@ def _interpolate(state: State, action: Action, motion: Motion) -> Outcome:
     removed = track.removed_frames - {frame}
     boxes = reinterpolate_frame(track.boxes, removed, frame, motion)
     if boxes is None:
-        raise InputError(f"track {track.id} has no key box on pair sides of frame {frame}")
+        raise InputError(f"track {track.id} has no key box on both sides of frame {frame}")
     return _replace(state, replace(track, boxes=boxes, removed_frames=removed))
 
 

@@ -24,9 +24,9 @@ MAX_LINES = 400
 
 # The packages and modules from the lowest layer up. Each imports only itself and lower ones.
 LAYERS = ("classes", "intensity", "types", "param_fields", "geometry", "camera", "groups", "robot",
-         "runs", "wire", "ground", "data", "clustering", "candidates", "detectors", "tracking",
-         "rendering", "scoring", "simulation", "sensor_setup", "training", "labels",
-         "detecting", "params", "api", "nodes", "cli", "testing")
+          "runs", "wire", "ground", "data", "clustering", "candidates", "detectors", "tracking",
+          "rendering", "scoring", "simulation", "sensor_setup", "training", "labels",
+          "detecting", "params", "api", "nodes", "cli", "testing")
 # Libraries that each layer may import besides lower layers and the standard library.
 NUMERIC = ["numpy", "scipy", "numba"]
 LIBRARIES = {
@@ -124,8 +124,8 @@ def test_only_msg_utils_messages_imports_by_name():
 
 
 CORE = [name for name in SOURCES
-           if not name.startswith((*(f"lidar_perception/{layer}/" for layer in LAYERS[-3:]),
-                                   "lidar_studio/cli/", "lidar_studio/live_view.py"))]
+        if not name.startswith((*(f"lidar_perception/{layer}/" for layer in LAYERS[-3:]),
+                                "lidar_studio/cli/", "lidar_studio/live_view.py"))]
 
 
 @for_all(CORE)

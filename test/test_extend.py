@@ -92,7 +92,7 @@ def test_detector_is_a_class_in_your_own_file(tmp_path):
     source, = re.findall(r"`my_detector.py`:\n\n```python\n(.*?)```", PAGE, re.S)
     (tmp_path / "my_detector.py").write_text(source)
     output = run(ROOT, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"),
-               "--weights", "my_detector:TallClusters", folder=tmp_path)
+                 "--weights", "my_detector:TallClusters", folder=tmp_path)
     assert "2 frames" in output and "Ped" in output
     run(ROOT, "detect", tmp_path / "kitti", "--weights", "my_detector:TallClusters", "--out",
         tmp_path / "results", folder=tmp_path)
@@ -102,14 +102,14 @@ def test_detector_is_a_class_in_your_own_file(tmp_path):
 def test_detector_is_one_folder_and_one_entry(copy, tmp_path):
     apply_example(copy, "sizes")
     output = run(copy, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"),
-               "--weights", "sizes")
+                 "--weights", "sizes")
     assert "2 frames" in output
 
 
 def test_ground_method_is_one_file_and_two_entries(copy, tmp_path):
     apply_example(copy, "lowest")
     output = run(copy, "evaluate", "segmentation", "--data", object_folder(tmp_path / "kitti"),
-               "--methods", "dbscan", "--set", "ground.method=lowest")
+                 "--methods", "dbscan", "--set", "ground.method=lowest")
     assert "ground by lowest" in output
 
 

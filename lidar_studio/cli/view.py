@@ -30,13 +30,13 @@ WEIGHTS = (".safetensors", ".onnx", ".json")
 @detectors_options
 @click.option("--results", multiple=True, type=click.Path(path_type=Path), metavar="FOLDER",
               help="KITTI result files, FOLDER/NAME.txt, such as `detect --format kitti "
-              "--out FOLDER` writes. May be wrong_options several times.")
+              "--out FOLDER` writes. May be given several times.")
 @click.option("--points", "--topic", "points", metavar="TOPIC", help="Topic of the clouds of a bag "
               "or of the running graph. Default: clustered ones, else /points, else the only cloud "
               "topic.")
 @click.option("--detections", multiple=True, metavar="TOPIC", help="With --live: a topic of boxes, "
               "MarkerArray or Detection3DArray. Default: all */output/detections that belong to "
-              "the clouds. May be wrong_options several times.")
+              "the clouds. May be given several times.")
 @click.option("--namespace", default="", metavar="NAME", help="With --live: show the nodes in "
               "this namespace, / for those without one, if several graphs run.")
 @click.option("--sequence", metavar="NAME", help="The drive of DATA to show, if it has "
