@@ -36,6 +36,7 @@ SIM = "sim"
 EXPERIMENTS = {  # name -> module:attribute of an Experiment; the first is the default
     "stm-cpa": "experiments.stm_cpa.experiment:STM_CPA",
     "stm-cpa-configurations": "experiments.stm_cpa.configurations:CONFIGURATIONS",
+    "eg-pointpillars": "experiments.eg_pointpillars.experiment:EG_POINTPILLARS",
     "clusters": "experiments.clusters.experiment:CLUSTERS",
     "clusters-segmentation": "experiments.clusters.experiment:SEGMENTATION",
 }
@@ -75,9 +76,9 @@ def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out
     """Run an experiment of a paper and report each value next to the paper's.
 
     EXPERIMENT is stm-cpa (default: every table of the STM-CPA paper), stm-cpa-configurations
-    (the configurations `paper` and `best`, with and without a labelled seed), clusters (adaptive
-    clustering and improved PointNet: every table) or clusters-segmentation (its tables without a
-    network).
+    (the configurations `paper` and `best`, with and without a labelled seed), eg-pointpillars
+    (the versions of EG-PointPillars, trained first), clusters (adaptive clustering and improved
+    PointNet: every table) or clusters-segmentation (its tables without a network).
 
     FOLDER gets report.html, report.md, report.json, the tables as CSV and the figures as PNG, and
     frames.jsonl with the record of every frame. Trained networks are in models/. Workers of --dask
@@ -89,6 +90,7 @@ def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out
       ./lidar reproduce stm-cpa-configurations /data/kitti/object --out configurations
       ./lidar reproduce clusters sim --budget 2 --out clusters
       ./lidar reproduce stm-cpa /nfs/kitti --out report --dask tcp://10.0.0.1:8786
+      ./lidar reproduce eg-pointpillars --data sim --budget 2 --out eg
     """
     name, data = _split_words(words, data)
     if dask and jobs:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 if TYPE_CHECKING:
     from experiments.framework.trained_models import Model, TrainedModel, Training
 
@@ -81,6 +83,15 @@ class Figure:
     panels: tuple[Panel, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A picture in the report, pixels (height, width, 3) uint8; name is as in Figure."""
+
+    name: str
+    title: str
+    pixels: np.ndarray
+
+
 @dataclass(frozen=True)
 class Section:
     """A heading of the report, with a text, tables and figures."""
@@ -88,7 +99,7 @@ class Section:
     title: str
     text: str = ""
     tables: tuple[Table, ...] = ()
-    figures: tuple[Figure, ...] = ()
+    figures: tuple[Figure | Picture, ...] = ()
 
 
 @dataclass(frozen=True)

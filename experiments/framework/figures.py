@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
+import base64
 from io import BytesIO
 from typing import Any
 
-from experiments.framework.experiment import Figure, Line
+from experiments.framework.experiment import Figure, Line, Picture
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito, 2008
 GREY = "#888888"
 MAX_COLUMNS = 3  # panels side by side
+
+
+def encode_figure(figure: Figure | Picture, *, dark: bool = False) -> str:
+    """Return a figure as a data URL for a page."""
+    kind, content = (("png", _encode_picture(figure)) if isinstance(figure, Picture)
+                     else ("svg+xml", draw_figure(figure, "svg", dark=dark)))
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def encode_png(figure: Figure | Picture) -> bytes:
+    """Return a figure as PNG."""
+    return _encode_picture(figure) if isinstance(figure, Picture) else draw_figure(figure, "png")
+
+
+def _encode_picture(picture: Picture) -> bytes:
+    from PIL import Image
+    stream = BytesIO()
+    Image.fromarray(picture.pixels).save(stream, format="png")
+    return stream.getvalue()
 
 
 def draw_figure(figure: Figure, kind: str = "svg", *, dark: bool = False) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import dataclasses
 import io
@@ -17,8 +16,8 @@ from rich.console import Console
 from rich.table import Table as Grid
 from rich.text import Text
 
-from experiments.framework.experiment import Cell, Experiment, Figure, Section, Table
-from experiments.framework.figures import draw_figure
+from experiments.framework.experiment import Cell, Experiment, Picture, Section, Table
+from experiments.framework.figures import encode_figure, encode_png
 from experiments.framework.report_files import REPORT
 from lidar_perception.runs.files import write_bytes, write_text
 
@@ -52,7 +51,7 @@ def write_report(out: Path, experiment: Experiment, records: list[dict[str, Any]
     for table in (table for section in sections for table in section.tables):
         write_text(out / "tables" / f"{table.name}.csv", to_csv(table))
     for figure in (figure for section in sections for figure in section.figures):
-        write_bytes(out / "figures" / f"{figure.name}.png", draw_figure(figure, "png"))
+        write_bytes(out / "figures" / f"{figure.name}.png", encode_png(figure))
     write_text(out / "report.md", to_markdown(experiment, sections, about, groups))
     write_text(out / "report.html", to_html(experiment, sections, about, groups))
     return out / "report.html"
@@ -90,16 +89,12 @@ def to_html(experiment: Experiment, sections: list[Section], about: dict[str, st
     """Return the report as one HTML page that needs no other file."""
     import jinja2
 
-    def make_picture(figure: Figure, dark: bool) -> str:
-        content = base64.b64encode(draw_figure(figure, "svg", dark=dark)).decode()
-        return f"data:image/svg+xml;base64,{content}"
-
     template = jinja2.Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"),
                                autoescape=True, undefined=jinja2.StrictUndefined)
     return template.render(
         title=experiment.title, question=experiment.question, about=about, skipped=skipped,
         sections=sections, legend=LEGEND, max_rows=MAX_ROWS, format_cell=format_cell,
-        make_picture=make_picture, is_number=is_number)
+        encode_figure=encode_figure, is_number=is_number)
 
 
 def to_markdown(experiment: Experiment, sections: list[Section], about: dict[str, str],
@@ -155,7 +150,12 @@ def to_csv(table: Table) -> str:
 
 
 def to_json_data(value: Any) -> Any:
-    """Convert dataclasses to dicts, arrays and tuples to lists, and NaN to None."""
+    """Convert dataclasses to dicts, arrays and tuples to lists, and NaN to None.
+
+    The pixels of pictures are left out; a PNG file has them.
+    """
+    if isinstance(value, Picture):
+        return {"name": value.name, "title": value.title}
     if dataclasses.is_dataclass(value):
         return {f.name: to_json_data(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, dict):

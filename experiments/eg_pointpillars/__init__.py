@@ -1,0 +1,1 @@
+"""Experiments of the EG-PointPillars paper (Ahn, Kim, Park, CMC 2026, 87(1), 84)."""

@@ -1,0 +1,83 @@
+"""Diagonals of clusters and of labelled boxes by class (Table 2 and Figure 13 of the paper)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from experiments.eg_pointpillars import paper
+from experiments.framework.experiment import Cell, Figure, Line, Panel, Row, Section, Table
+from experiments.framework.statistics import bootstrap, divide, make_cells, nan_to_none
+from lidar_perception.clustering.shapes import classify_by_diagonal
+from lidar_perception.types import CLASSES
+
+NAMES = tuple(paper.TABLE_2)
+BACKGROUND = "background"
+BINS = np.arange(0.0, 8.01, 0.2)  # of Figure 13, metres
+PERCENTILES = (5, 50, 95)
+
+
+def make_diagonal_section(records: list[dict[str, Any]]) -> Section:
+    """Return Table 2 and Figure 13 of records of measure_frame()."""
+    tables = []
+    for key, title in (("boxes", "Labelled boxes"), ("clusters", "Clusters of Patchwork++ and "
+                                                                 "DBSCAN")):
+        counts = np.array([count_classes(record[key]) for record in records],
+                          float).reshape(-1, len(NAMES) + 1, len(NAMES) + 1)
+        shares = bootstrap(counts, lambda sums: 100 * divide(sums, sums.sum(-1, keepdims=True)))
+        values = np.array([pair for record in records for pair in record[key]]).reshape(-1, 2)
+        rows: list[Row] = []
+        for i, name in enumerate((*NAMES, BACKGROUND)):
+            own = values[_find_class(values[:, 0]) == i, 1]
+            if key == "boxes" and name == BACKGROUND:
+                continue
+            limits = paper.TABLE_2.get(name)
+            ends = np.percentile(own, PERCENTILES) if len(own) else np.full(3, np.nan)
+            rows.append((name, str(len(own)),
+                         *(Cell(v, digits=2) for v in nan_to_none(ends)),
+                         f"{limits[0]:.2f} to {limits[1]:.2f}" if limits else "none",
+                         *make_cells(shares[:, i])))
+        header = ("class", "number", *(f"{p} % [m]" for p in PERCENTILES), "limits of Table 2 [m]",
+                  *(f"taken for {name} [%]" for name in (*NAMES, "none")))
+        tables.append(Table(f"table_2_{key}", title, header, tuple(rows)))
+    text = ("Table 2 classifies a cluster by the diagonal of its box in x-y. The paper shows the "
+            "diagonals of the labelled boxes of KITTI (Figure 13) and chose limits for clusters "
+            "by hand. Here a cluster has the class of the labelled box that contains most of its "
+            "points; all others are background.")
+    return Section("Class by diagonal (Table 2, Figure 13)", text, tuple(tables),
+                   (_draw_histograms(records),))
+
+
+def _find_class(class_ids: np.ndarray) -> np.ndarray:
+    """Return the index into NAMES of classes (K,); len(NAMES) for all others."""
+    found = np.full(len(class_ids), len(NAMES))
+    for i, name in enumerate(NAMES):
+        found[class_ids == CLASSES.index(name)] = i
+    return found
+
+
+def count_classes(pairs: list[list[float]]) -> list[list[int]]:
+    """Count true class by class of Table 2, (4, 4), the last of each being none."""
+    values = np.array(pairs, float).reshape(-1, 2)
+    boxes = np.zeros((len(values), 7))
+    boxes[:, 3] = values[:, 1]
+    counts = np.zeros((len(NAMES) + 1, len(NAMES) + 1), int)
+    np.add.at(counts, (_find_class(values[:, 0]), _find_class(classify_by_diagonal(boxes))), 1)
+    return counts.tolist()
+
+
+def _draw_histograms(records: list[dict[str, Any]]) -> Figure:
+    panels = []
+    for key, title in (("boxes", "labelled boxes"), ("clusters", "clusters")):
+        values = np.array([pair for record in records for pair in record[key]]).reshape(-1, 2)
+        lines = []
+        for i, name in enumerate(NAMES):
+            counts, _ = np.histogram(values[_find_class(values[:, 0]) == i, 1], BINS)
+            share = 100 * counts / max(counts.sum(), 1)
+            lines.append(Line(name, (BINS[:-1] + np.diff(BINS) / 2).tolist(), share.tolist()))
+            low = paper.TABLE_2[name][0]
+            lines.append(Line(f"{name}, lower limit of Table 2", (low, low), (0.0, 100.0),
+                              dashed=True))
+        panels.append(Panel(title, "diagonal in x-y [m]", "% of the class", tuple(lines)))
+    return Figure("figure_13", "Figure 13: diagonals by class", tuple(panels))

@@ -1,0 +1,98 @@
+"""Measurement of the EG-PointPillars experiment on one frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from experiments.framework.precision import to_record
+from experiments.framework.trained_models import TrainedModel
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.clustering.shapes import fit_boxes
+from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.contract import Detector
+from lidar_perception.detectors.normalized_view import NormalizedView, segment_view_ground
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.pointpillars.config import AHEAD
+from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
+from lidar_perception.geometry import is_within, points_in_boxes
+from lidar_perception.ground.params import SensorPoseParams
+from lidar_perception.scoring.kitti.camera_objects import to_camera_objects, to_scored_labels
+from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, PointCloud
+
+MIN_SCORE = 0.05   # boxes of lower score hardly change the average precision
+MIN_SHARE = 0.5    # of the points of a cluster that are in a box, so that it is of the box's class
+NO_CLASS = -1
+
+
+def measure_frame(frames: Sequence[Frame], number: int, models: Mapping[str, TrainedModel]
+                  ) -> dict[str, Any]:
+    """Measure frame `number` and return its record.
+
+    - true: the labels, see precision.to_record()
+    - found: network -> its detections, in the same form
+    - ms: network -> time in all, and of each step
+    - boxes: [class, diagonal] of each label
+    - clusters: [class, diagonal] of each cluster, NO_CLASS for the background
+    """
+    frame = frames[number]
+    truth, calibration = frame.truth(), frame.calibration()
+    if truth is None:
+        raise InputError(f"{frame.points or frame.name} has no labels")
+    scan = frame.load()
+    found, ms = {}, {}
+    names = [*models]
+    turn = number % max(len(names), 1)  # so that warm caches help no network more than others
+    for name in (*names[turn:], *names[:turn]):
+        detector = open_network(str(models[name].weights), frame.sensor_height)
+        begun = perf_counter()
+        result = detector(scan)
+        duration = 1e3 * (perf_counter() - begun)
+        found[name] = to_record(to_camera_objects(to_scored_labels(result.detections),
+                                                  calibration))
+        ms[name] = {"total": round(duration, 2),
+                    **{step: round(value, 2) for step, value in result.timings.items()}}
+    return {"frame": frame.name, "true": to_record(to_camera_objects(truth, calibration)),
+            "found": {name: found[name] for name in names}, "ms": ms,
+            **measure_diagonals(scan, truth, frame.sensor_height)}
+
+
+@lru_cache(maxsize=64)
+def open_network(weights: str, sensor_height: float) -> Detector:
+    """Open a network once in a process, warmed up, with a low threshold for all classes."""
+    return open_detector(weights, sensor_height=sensor_height, min_score=MIN_SCORE)
+
+
+def measure_diagonals(scan: PointCloud, truth: GroundTruth, sensor_height: float
+                      ) -> dict[str, list[list[float]]]:
+    """Measure the diagonals in x-y of labelled boxes, and of clusters (Table 2 and Figure 13).
+
+    A cluster has the class of the box that contains most of its points, at least MIN_SHARE. Boxes
+    and clusters are those in the range of the network.
+    """
+    view = NormalizedView.of(scan, SensorPoseParams(height=sensor_height), **AHEAD).frame
+    true_boxes = truth.boxes + np.array([0, 0, sensor_height - SENSOR_HEIGHT, 0, 0, 0, 0])
+    inside = np.flatnonzero(is_within(true_boxes, AHEAD["low"], AHEAD["high"]))
+    true_boxes, classes = true_boxes[inside], truth.class_ids[inside]
+    ground = segment_view_ground(view, EXPERT_GROUND)
+    ids = cluster_obstacles(view.xyz, ground, EXPERT_CLUSTERING)
+    boxes = fit_boxes(view.xyz, ids, "min_area")
+    sizes = np.bincount(ids, minlength=len(boxes) + 1)[1:]
+    rows, first = points_in_boxes(view.xyz, true_boxes)
+    counts = np.stack([np.bincount(ids[rows[first[k]:first[k + 1]]], minlength=len(boxes) + 1)[1:]
+                       for k in range(len(true_boxes))] or [np.zeros(len(boxes), int)])
+    best = counts.argmax(axis=0)
+    is_object = counts.max(axis=0) >= np.maximum(MIN_SHARE * sizes, 1)
+    owners = np.where(is_object, classes[best], NO_CLASS) if len(classes) else np.full(
+        len(boxes), NO_CLASS)
+    return {"boxes": _list_diagonals(classes, true_boxes),
+            "clusters": _list_diagonals(owners, boxes)}
+
+
+def _list_diagonals(classes: np.ndarray, boxes: np.ndarray) -> list[list[float]]:
+    diagonals = np.hypot(boxes[:, 3], boxes[:, 4])
+    return [[int(c), round(float(d), 3)] for c, d in zip(classes, diagonals)]

@@ -1,0 +1,45 @@
+"""The networks of the experiment: five versions, and two of them with fewer labelled scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from experiments.eg_pointpillars import paper
+from experiments.framework.trained_models import Model, TrainedModel
+from lidar_perception.detectors.pointpillars.config import VERSIONS
+from lidar_perception.param_fields import with_values
+from lidar_perception.training.params import PointPillarsTraining
+
+TRAINING = PointPillarsTraining()
+# Whole range, full size and number of epochs as in Section 4.1.
+PROTOCOL = {"size": "full", "score": "map", "epochs": float(paper.EPOCHS),
+            "validate_epochs": float(paper.VALIDATION_EPOCHS), "ahead": 1000.0, "aside": 1000.0}
+STUDIED = "v0", "v4"          # in the study of labels
+SHARES = (0.5, 0.25, 0.1)     # of the labelled scenes, beside all
+ALL_SHARES = (*reversed(SHARES), 1.0)
+
+
+def choose_models(params: PointPillarsTraining, seed: int) -> list[Model]:
+    """Return the networks of a seed: all versions, then those of the study of labels."""
+    def make(version: str, share: float) -> Model:
+        return Model(name_model(version, share, seed),
+                     with_values(params, {"version": version, "seed": seed}), share,
+                     required=share == 1.0)
+    return [*(make(version, 1.0) for version in VERSIONS),
+            *(make(version, share) for share in SHARES for version in STUDIED)]
+
+
+def name_model(version: str, share: float, seed: int) -> str:
+    """Return the name of a network, such as "V4, 25 % of the labels, seed 0"."""
+    labels = "" if share == 1.0 else f", {100 * share:g} % of the labels"
+    return f"{version.upper()}{labels}, seed {seed}"
+
+
+def group_seeds(models: Mapping[str, TrainedModel]) -> dict[tuple[str, float], list[str]]:
+    """Return (version, share of the labels) -> names of the networks of all seeds."""
+    groups: dict[tuple[str, float], list[str]] = {}
+    for name, trained in models.items():
+        params: Any = trained.model.params
+        groups.setdefault((params.version, trained.model.label_share), []).append(name)
+    return groups
