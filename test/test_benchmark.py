@@ -166,7 +166,7 @@ def test_pointnet_is_timed_against_a_plain_network(one_thread, capsys):
     shown = capsys.readouterr().out
     assert all(name in shown for name in ("improved PointNet", "plain PointNet++", "clustering"))
     assert content["clusters"] >= 1 and all(value > 0 for value in content["ms"].values())
-    # the peer groups as it should: what is near it finds, and points in any order are the same
+    # The plain PointNet++ samples distant points and groups near ones.
     xyz = torch.tensor([[[0.0, 0, 0], [5, 0, 0], [0.1, 0, 0], [0, 0.3, 0]]])
     assert farthest(xyz, 3).tolist()[0][:2] == [0, 1]
     assert ball(0.2, 2, xyz, xyz[:, :1]).tolist() == [[[0, 2]]]

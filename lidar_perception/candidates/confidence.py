@@ -88,7 +88,7 @@ def compute_shape_features(xyz: np.ndarray, start: np.ndarray, boxes: np.ndarray
 
 def compute_confidence(shape: dict[str, np.ndarray], similarity: np.ndarray | None = None,
                        height_difference: np.ndarray | None = None) -> np.ndarray:
-    """Return (K,) float64 the probability that each cluster is a pedestrian, 0..1.
+    """Return the probability (K,) float64, 0..1, that each cluster is a pedestrian.
 
     The probability holds for simulated scans whose pedestrians are distributed over range as in
     KITTI's labels (paper A, Table 1).

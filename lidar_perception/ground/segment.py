@@ -68,6 +68,6 @@ def level_points(xyz: np.ndarray, pose: SensorPoseParams) -> np.ndarray:
 
 def crop_with_sensor_pose(frame: PointCloud, crop: CropParams,
                           pose: SensorPoseParams) -> tuple[np.ndarray, PointCloud]:
-    """Crop a frame as robot.crop.cropped does, with sectors as a level sensor would see them."""
+    """Crop a frame with robot.crop.crop_frame, with the sectors of a level sensor."""
     return crop_frame(frame, crop,
                       level=find_level_transform(make_tilted_pose(pose.roll, pose.pitch)))

@@ -46,7 +46,7 @@ ALL = "kitti,json,csv,mcap,openlabel"
 
 @pytest.fixture(autouse=True)
 def made(monkeypatch):
-    """The detector `made` is known; what any such one has seen."""
+    """Register MadeDetector under NAME, and return the list of its calls."""
     monkeypatch.setitem(LOAD, NAME, "")
     monkeypatch.setattr(opening, "_loader", lambda kind: detect_samples.opened)
     monkeypatch.setattr(MadeDetector, "calls", [])
@@ -149,7 +149,7 @@ def test_a_bag_holds_what_the_nodes_publish(drives, tmp_path, monkeypatch, cloud
 
 def test_bag_with_duplicate_stamps_is_written_without_labels(tmp_path, monkeypatch,
                                                              capsys):
-    """Nothing would say whose the labels are."""
+    """Labels are assigned by stamp, which would be ambiguous."""
     frames = [replace(frame, stamp_ns=STAMP) for frame in scans(3)]
     recording = Recording(tmp_path, "", frames)
     run = make_run(recording, tmp_path / "out")
@@ -178,7 +178,7 @@ def test_written_results_score_like_the_detector(kitti, tmp_path, monkeypatch, c
 
 
 def numbers_in(content):
-    """All numbers in nested dicts, in their order."""
+    """Return all numbers in nested dicts, in their order."""
     inner = content.values() if isinstance(content, dict) else [content]
     return [number for each in inner for number in (
         numbers_in(each) if isinstance(each, dict) else [each] * (each is not None))]
@@ -231,7 +231,7 @@ def test_written_tracks_score_like_the_tracker(drives, tmp_path, monkeypatch):
 
 
 def test_drives_of_a_bag_are_tracked_apart(tmp_path, monkeypatch):
-    """They have no names, so their files are numbered."""
+    """Drives of a bag have no names, so their files are numbered."""
     stamps = [STAMP + s * 10**8 for s in (0, 1, 100, 101)]
     write_bag(tmp_path / "bag", [Frame.of(str(i), cloud_frame(scene(i), stamp))
                                  for i, stamp in enumerate(stamps)])
@@ -250,7 +250,7 @@ def test_drives_of_a_bag_are_tracked_apart(tmp_path, monkeypatch):
 
 
 class Stopped(Exception):
-    """Ends a run in the middle."""
+    """Stop a run in the middle."""
 
 
 def test_a_run_that_was_stopped_is_resumed(drives, tmp_path, made):

@@ -41,7 +41,7 @@ def frame():
 
 @pytest.fixture(scope="module")
 def detectors(frame, tmp_path_factory):
-    """name -> detector of every contender, whose networks are random."""
+    """Return the detector of every contender by name, with random networks."""
     folder = tmp_path_factory.mktemp("weights")
     for name, made, config in (("a", detection_samples, detection_samples.tiny()),
                                ("b", pointnet_samples, pointnet_samples.small())):
@@ -70,7 +70,7 @@ def test_detector_has_classes_and_thresholds(detectors, name):
 
 @each_name
 def test_an_array_is_taken_like_its_frame(detectors, frame, name):
-    """With columns of all its rows, of which some are not usable."""
+    """Columns have a value for each row, also for unusable points."""
     scan, detector = frame.load(), detectors[name]
     cloud, ground = scan.points(), scan.xyz[:, 2] < -1.5
     assert same(detector(cloud), detector(scan))
@@ -104,7 +104,7 @@ def test_other_intensity_scale_is_reported_and_normalized(detectors, frame, name
 
 @given(st.integers(0, 2**32 - 1))
 def test_ego_vehicle_is_dropped_for_any_heading(seed):
-    """Boxes that hold it, but for a mast of 1 m, and cars below it that come nearer than 1 m."""
+    """Dropped are boxes that contain the sensor or a mast of 1 m, and cars below it within 1 m."""
     rng = np.random.default_rng(seed)
     boxes = np.column_stack([rng.uniform(-4, 4, (50, 3)), rng.uniform(0.5, 5, (50, 3)),
                              rng.uniform(-4, 4, 50)])
@@ -127,8 +127,8 @@ def test_ego_vehicle_is_dropped_for_any_heading(seed):
 @pytest.mark.parametrize("pose", [SensorPoseParams(), SensorPoseParams(height=2.4),
                                   SensorPoseParams(roll=np.pi), SensorPoseParams(height=6.0)])
 def test_ego_vehicle_is_dropped_and_next_car_is_kept(pose):
-    """Its roof in three parts, as the weights of the package saw KITTI's; however the sensor is
-    mounted, but for one so high above the car that this is another one."""
+    """The roof is detected in three parts, as in KITTI, with any mounting up to MAX_MAST_M above
+    the car."""
     up = pose.height - SENSOR_HEIGHT
     roof = np.array([[-0.2, 0.1, up - 1.0, 3.8, 1.6, 1.5, 0.9],
                      [0.8, -1.7, up - 1.0, 4.0, 1.7, 1.5, -0.1],

@@ -33,13 +33,13 @@ ODD = [None, True, 0, 1, -1, 2, 3, 63, 64, 1e-9, 0.5, -1e308, 1e308, math.nan, m
 
 
 def write(path, tensors, header):
-    """A checkpoint with any text as its header."""
+    """Write a checkpoint with any text as its header."""
     path.write_bytes(save({name: value.contiguous() for name, value in tensors.items()},
                           {KEY: header}))
 
 
 def places(value, path=()):
-    """The paths of all values within JSON."""
+    """Return the paths of all values in a JSON object."""
     yield path
     if isinstance(value, dict | list):
         for key, part in value.items() if isinstance(value, dict) else enumerate(value):
@@ -47,7 +47,7 @@ def places(value, path=()):
 
 
 def mutated(header, rng):
-    """A header with a few of its values changed, removed, added, or put deeper."""
+    """Return a header with a few values changed, removed, added or nested deeper."""
     header = {"": copy.deepcopy(header)}
     for _ in range(rng.choice([1, 1, 1, 2, 5])):
         *path, last = rng.choice([*places(header)][1:])
@@ -124,7 +124,7 @@ def test_constant_scores_are_reported_as_broken_weights():
 
 
 def test_onnx_files_with_other_inputs_are_refused(tmp_path):
-    """Renamed, of another type or rank, or missing: none of them reaches a cloud."""
+    """Inputs are renamed, of another type or rank, or missing."""
     onnx = pytest.importorskip("onnx", reason="needs the extra [onnx]")
     pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
     from onnx import TensorProto, helper

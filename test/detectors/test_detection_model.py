@@ -40,7 +40,7 @@ each_version = pytest.mark.parametrize("version", VERSIONS)
 
 
 def some_points(config, count=600, seed=0, margin=0.0) -> torch.Tensor:
-    """Points all over the range, grown by margin; a few in each pillar they touch."""
+    """Return points all over the range, enlarged by margin, with a few in each pillar."""
     rng = torch.Generator().manual_seed(seed)
     low, high = torch.tensor(config.low) - margin, torch.tensor(config.high) + margin
     points = torch.rand(count, config.point_columns, generator=rng)

@@ -156,7 +156,7 @@ def test_no_valid_objects_give_background_only():
 
 
 def outputs_of(targets, classes=3, sure=12.0):
-    """Outputs that are just right."""
+    """Return network outputs that equal the targets."""
     logits = torch.full((*targets.labels.shape, classes), -sure)
     directions = torch.nn.functional.one_hot(targets.bins, 2).float() * 2 * sure
     positive = targets.labels >= 0
@@ -260,7 +260,7 @@ def test_suppression_is_that_of_a_slow_loop(seed, across):
 
 
 def test_nms_equals_brute_force_over_all_pairs():
-    """A long box reaches far; boxes without area or position overlap nothing and stay."""
+    """Boxes without area or position overlap nothing and are kept."""
     rng = np.random.default_rng(0)
     boxes = some_boxes(0, 200, spread=20)
     boxes[:5, 3], boxes[5:8, 4], boxes[8:11, 0], boxes[11, 1] = 30.0, 0.0, np.nan, np.inf

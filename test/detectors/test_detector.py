@@ -226,7 +226,7 @@ def test_columns_of_another_length_are_refused():
 
 
 class OutOfMemory(TorchNetwork):
-    """A network for which another device than the CPU has no memory."""
+    """A network that runs out of memory on every device but the CPU."""
 
     def __init__(self, network):
         super().__init__(network, CPU)

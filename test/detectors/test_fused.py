@@ -85,7 +85,7 @@ def test_points_in_boxes_equals_points_in_box(seed, count, boxes, margin):
 
 
 def shell(box: np.ndarray, rng, count: int = 400) -> np.ndarray:
-    """Points of the two faces of a box that a sensor at 0 sees, as deep as those of cars."""
+    """Return points on the two faces of a box that a sensor at the origin sees."""
     sensor = np.array([[np.cos(box[6]), np.sin(box[6])], [-np.sin(box[6]), np.cos(box[6])]]) @ (
         -box[:2])
     flat = rng.uniform(-0.5, 0.5, (count, 3)) * box[3:6]

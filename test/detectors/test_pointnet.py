@@ -49,7 +49,7 @@ def rng():
 
 
 def network(name="improved", **changes):
-    """One with weights, norms and all, that are not those of the beginning."""
+    """Return a network with random weights and norms, in eval mode."""
     torch.manual_seed(3)
     net = make_pointnet(make_pointnet_config(name, **{**SMALL, **changes})).eval()
     for buffer_name, buffer in net.named_buffers():

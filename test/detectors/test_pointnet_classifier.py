@@ -28,7 +28,7 @@ def frame():
 
 @pytest.fixture
 def proposals():
-    """Return boxes on two people and a thing, and one without points."""
+    """Return boxes around two people and a post, and one without points."""
     boxes = boxes_at([(7, 2), (12, -5), (10.95, 9.5), (30, 30)])
     boxes[2, 3:6] = 2.5, 3.5, 1.6
     return Detections.of(boxes, [PEDESTRIAN, CAR, CAR, PEDESTRIAN], [0.9, 0.8, 0.5, 0.4])

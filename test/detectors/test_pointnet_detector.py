@@ -52,7 +52,7 @@ def ids() -> np.ndarray:
 
 
 def moved(found: Detections, turn: float = 0.0, shift=(0, 0, 0)) -> Detections:
-    """Turned about the sensor's z axis, then shifted."""
+    """Rotate a frame about the sensor's z axis, then shift it."""
     boxes = found.boxes.astype(np.float64)
     cos, sin = np.cos(turn), np.sin(turn)
     boxes[:, :2] = boxes[:, :2] @ np.array([[cos, sin], [-sin, cos]])
@@ -271,7 +271,7 @@ def test_cpu_fallback_after_out_of_memory_is_reported(ids, monkeypatch):
 
 @pytest.fixture
 def saved(tmp_path):
-    """Checkpoints of both networks."""
+    """Return checkpoints of both networks."""
     config, other = small(), tiny_pointpillars("v4")
     header = Header(config, {"data": "simulated"}, {"accuracy": 0.9}, "abc123")
     save_checkpoint(tmp_path / "n.safetensors", lively(config), header)
@@ -281,7 +281,7 @@ def saved(tmp_path):
 
 
 def with_header(path, out, **changes):
-    """A copy of a checkpoint with other things in its header; None removes them."""
+    """Copy a checkpoint with changed values in its header; None removes them."""
     content = path.read_bytes()
     length = struct.unpack("<Q", content[:8])[0]
     names = json.loads(content[8:8 + length])

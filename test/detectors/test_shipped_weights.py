@@ -81,7 +81,7 @@ def test_only_cars_are_moved_to_their_points(name, scans):
 
 
 def test_ego_vehicle_is_not_detected(data):
-    """All around, in whole scans of KITTI, whose roof returns some points."""
+    """Whole scans of KITTI contain some points of the roof."""
     frames = [frame for frame in open_recording(data / "kitti_object")
               if (frame.load().xyz[:, 0] < -5).any()][:3]
     for detector in open_detector("fused", "cpu", range="around"), open_detector("pointnet", "cpu"):

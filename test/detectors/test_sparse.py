@@ -38,7 +38,7 @@ WIDE = dict(low=(-12.8, -14.08, -3.0), high=(12.8, 14.08, 1.0))  # 176 x 160 pil
 
 
 def strong(config, seed=0):
-    """A network in which a point still matters after the last layer."""
+    """Return a network in which each point affects the outputs of the last layer."""
     network = lively(config, seed)
     for module in network.modules():
         if isinstance(module, torch.nn.Conv2d) and module.kernel_size == (3, 3):
@@ -51,8 +51,8 @@ def sparse_network(network):
 
 
 def inputs(config, points, drawn, seed=0, share=1.0):
-    """Pillars of uniformly random points in a share of each axis, from the lowest corner, and a map
-    with the share `drawn` of its cells drawn there."""
+    """Return pillars of random points in a share of each axis, and a cluster map with the share
+    `drawn` of its cells filled there."""
     rng = np.random.default_rng(seed)
     cloud = rng.uniform([*config.low, 0], [*config.high, 1], (points, 4))
     cloud[:, :2] = config.low[:2] + share * (cloud[:, :2] - config.low[:2])
@@ -66,7 +66,7 @@ def inputs(config, points, drawn, seed=0, share=1.0):
 
 
 def by_torch(network, pillars, maps):
-    """Features and logits (H * W, C) of all cells."""
+    """Return features and logits (H * W, C) of all cells."""
     pillars = Pillars(*map(torch.from_numpy, pillars[:3]), *pillars[3:])
     features = network.features(pillars, None if maps is None else torch.from_numpy(maps))
     return [x[0].flatten(1).T.numpy() for x in (features, network.head.scores(features))]

@@ -164,7 +164,7 @@ def test_missing_shipped_weights_are_requested(tmp_path, monkeypatch):
 @needs_onnx
 @pytest.mark.no_cover
 def test_an_exported_network_finds_the_same(tmp_path):
-    """The first version; the command exports the last, of which those between have parts."""
+    """v0 is exported here, v4 by the command; the others have parts of both."""
     from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork, export_onnx
     config = tiny("v0", anchors=tiny().anchors[:1], max_points=3, zero_row=True, middle_z=True)
     network, header = lively(config), Header(config, {"steps": 3})
@@ -199,7 +199,7 @@ def test_export_reads_checkpoints_and_refuses_bad_files(saved, tmp_path, monkeyp
 # weights of other projects
 
 def theirs(state, project):
-    """Our state dict under the names, and with the points' inputs, of another project."""
+    """Convert our state dict to the names and point inputs of another project."""
     names = {"OpenPCDet": ("vfe", "backbone_2d.blocks", "backbone_2d.deblocks", "dense_head",
                            ("conv_cls", "conv_box", "conv_dir_cls"), 1),
              "mmdetection3d": ("voxel_encoder", "backbone.blocks", "neck.deblocks", "bbox_head",
@@ -223,7 +223,7 @@ def theirs(state, project):
 
 @pytest.fixture(scope="module")
 def big():
-    """A v0 full network as those projects have it, with ten inputs for each point."""
+    """Return a v0 full network with ten inputs per point, as in those projects."""
     return lively(make_config("v0", "full", middle_z=True)).state_dict()
 
 
@@ -262,7 +262,7 @@ def test_weights_are_imported_from_the_command_line(big, tmp_path):
 
 
 class Code:
-    """An object that runs code when unpickled, which weights_only must prevent."""
+    """An object that runs code when it is unpickled; weights_only must prevent that."""
 
     def __reduce__(self):
         return print, ("run",)

@@ -24,14 +24,14 @@ def frame(true: np.ndarray, found: np.ndarray, scores=0.9):
 
 
 def cars(count: int, rng) -> np.ndarray:
-    """On a circle spiralling outwards, so that none touches another."""
+    """Return cars on an outward spiral, so that none touches another."""
     way, away = np.linspace(-1, 1, count), np.linspace(8, 70, count)
     return np.column_stack([away * np.cos(way), away * np.sin(way), np.full(count, -0.9),
                             np.tile([4.0, 1.7, 1.5], (count, 1)), rng.uniform(-3, 3, count)])
 
 
 def moved(boxes: np.ndarray, away=0.0, aside=0.0, **sizes) -> np.ndarray:
-    """Boxes that are off along the ray and to its left, with bottoms where they were."""
+    """Shift boxes along the ray and to its left, and change sizes with the bottoms in place."""
     azimuth = np.arctan2(boxes[:, 1], boxes[:, 0])
     off = boxes.copy()
     off[:, 0] += np.cos(azimuth) * away - np.sin(azimuth) * aside

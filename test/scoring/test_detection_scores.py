@@ -1,4 +1,4 @@
-"""KITTI's protocol: cases worked out by hand, laws, and a second reading of it."""
+"""KITTI's protocol: hand-computed cases, invariants, and an independent implementation."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def labels(text):
 
 
 def report(frames, calibration=CALIBRATION):
-    """frames: (label text, result text)."""
+    """Return the report of frames, pairs of label text and result text."""
     total = DetectionReport()
     for truth, found in frames:
         total.update(FrameDetections("frame", labels(truth), labels(found), calibration))
@@ -56,7 +56,7 @@ def ap(frames):
 
 
 def numbers(content):
-    """All numbers of a report's ap, in order; nothing for what has no objects."""
+    """Return all numbers in the ap of a report, in order."""
     if isinstance(content, dict):
         return [n for value in content.values() for n in numbers(value)]
     return [] if content is None else [content]
@@ -151,7 +151,7 @@ def test_average_precision_equals_hand_computed_value():
     ("24 pixels", None, car(**WRONG, bottom=174, score=0.95), "hard", 100, 100),
     ("25 pixels", None, car(**WRONG, bottom=175, score=0.95), "hard", 50, 50),
     ("another class", None, car("Pedestrian", **WRONG, score=0.95), "easy", 100, 100),
-    # What is lower than 25 pixels is ignored, but it takes the car from what is found there.
+    # A detection lower than 25 pixels is ignored, but it is matched with the car.
     ("24 pixels, another class", None, car("Pedestrian", bottom=174, score=0.95), "hard", 100, 0),
     # The better score is the only threshold, and above it nothing is wrong.
     ("found twice", None, car(score=0.95), "easy", 100, 100),
@@ -334,7 +334,7 @@ def test_wrong_heights_are_diagnosed(shift, taller, words):
 
 
 def brute_best(scores):
-    """The greatest F1 over every score that occurs."""
+    """Return the highest F1 over all scores as thresholds."""
     return max(scores.make_rows(s)["all"]["f1"] for _, _, found in scores.frames for s in found)
 
 
@@ -371,7 +371,7 @@ def test_pedestrians_by_centre_distance_worked_out_by_hand():
     total.update(FrameDetections("no pedestrian", GroundTruth.of([], []), found, CALIBRATION))
     content = total.compute()["pedestrian_centres"]
     assert (content["frames"], content["ground_truth"]) == (1, 2)
-    # near hits; far does not; what is behind the camera does not count: 2 * 1 / (2 + 2)
+    # Only the near one is a hit; boxes behind the camera do not count: 2 * 1 / (2 + 2)
     assert content["of_all"]["all"]["f1"] == 0.5
     assert content["best_score"] == pytest.approx(0.8)  # 2 * 1 / (1 + 2)
     assert content["at_best_score"]["all"]["f1"] == pytest.approx(2 / 3)
@@ -385,7 +385,7 @@ def test_thresholds_are_scores_of_hits_at_evenly_spaced_recall(seed, objects):
     chosen = choose_thresholds(hits, objects)
     assert len(chosen) <= 41 and (np.diff(chosen) < 0).all() and np.isin(chosen, hits).all()
     recall = np.array([(hits >= t).sum() for t in chosen]) / objects
-    # each within half a step of its point; the last hit stands for what is left
+    # Each is within half a step of its recall point; the last hit covers the remaining points.
     np.testing.assert_allclose(recall[:-1], np.arange(len(chosen) - 1) / 40,
                                atol=1 / objects + 1e-9)
     assert chosen[-1] == hits.min()

@@ -49,14 +49,13 @@ def kitti(tmp_path):
 
 @pytest.fixture
 def found(tmp_path):
-    """What is there, as result files."""
+    """Result files with the labelled objects."""
     return result_files(tmp_path / "found", f"{PERSON} 0.9\n{WHOLE} 0.8\n")
 
 
 @pytest.fixture
 def detector(monkeypatch):
-    """A stand-in for the detector of a checkpoint: finds what made.boxes says, and says what it
-    was asked."""
+    """Replace the detector of a checkpoint by made.find, and record the calls in made.asked."""
     made = types.SimpleNamespace(asked=[], scans=[], find=lambda frame: Detections.none())
 
     def open_detector(path, device="auto", *, min_score=None, sensor_height=None,
@@ -94,7 +93,7 @@ def test_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path, mon
 
 
 def test_short_bag_has_no_interval(kitti, detector, tmp_path):
-    """A second of one drive is one thing to draw, so there is no interval."""
+    """One second of a drive is a single block, so nothing can be resampled."""
     detector.find = lambda frame: truth_of(kitti)
     write_bag(tmp_path / "bag", open_recording(kitti))
     arguments = "--weights", "any", "--intervals", 10
@@ -200,7 +199,7 @@ def test_result_files_hold_what_was_found(tmp_path):
 
 
 def test_result_files_keep_the_order_of_weak_scores(tmp_path):
-    """Average precision is made of many boxes just above its least score."""
+    """Average precision depends on many boxes just above the lowest score."""
     scores = np.float32(0.001 + 3e-6 * np.arange(100))
     write_results(tmp_path / "a.txt", Detections.of(np.tile([20.0, 0, -1, 4, 2, 1.5, 0], (100, 1)),
                                                     0, scores), CALIBRATION)
@@ -323,8 +322,8 @@ def test_real_labels_as_results_score_100(data, tmp_path):
 
 @pytest.mark.no_cover
 def test_real_boxes_project_onto_their_2d_labels(data, detector, tmp_path):
-    """Boxes, and nothing else, score 100 from above and in space. In the image a person's limbs
-    and what hides him make his label differ from the projection of his box."""
+    """Boxes alone score 100 in BEV and 3D. In the image, limbs and occlusion make the label of a
+    person differ from the projection of the box."""
     truths = iter([f.truth() for f in open_recording(data / "kitti_object")])
 
     def find(frame):

@@ -39,7 +39,7 @@ def root(tmp_path):
 
 
 def detections(frame, seed=0):
-    """What is there of the classes that detectors know, a little off, and a Van."""
+    """Labelled objects of the detected classes, slightly displaced, and a Van."""
     truth, rng = frame.truth(), np.random.default_rng(seed)
     kept = np.isin(truth.class_ids, [CLASSES.index(name) for name in NAME_BY_CLASS])
     kept &= np.array([extras["points"] > 0 for extras in truth.extras])

@@ -1,4 +1,4 @@
-"""Laws of matching and scores: optimal, one to one, and the counts add up."""
+"""Matching and scores: optimal and one to one, and counts add up."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def some(rng, count, reach=1.2):
 
 
 def brute_force(found, truth, limit):
-    """Most pairs, then least distance, over every way to pair the smaller set with the larger."""
+    """Return the best of all pairings: most pairs, then least distance."""
     if len(found) > len(truth):
         return brute_force(truth, found, limit)
     best = (0, 0.0)

@@ -1,4 +1,5 @@
-"""nuScenes' detection task: hand-made cases, a second reading, and nuscenes-devkit."""
+"""nuScenes' detection task: hand-computed cases, an independent implementation, and nuscenes-
+devkit."""
 
 from __future__ import annotations
 
@@ -30,7 +31,7 @@ ERRORS = dict(zip(("ate", "ase", "aoe", "ave", "aae"), reference.ERRORS))
 
 
 def boxes(*centres, kind="car", scores=0.0, yaw=0.0, **columns):
-    """Boxes of 4 x 2 x 1.5 m at (x, y)."""
+    """Return boxes of 4 x 2 x 1.5 m at (x, y)."""
     count = len(centres)
     return GlobalBoxes.of([[*c, 0.0] for c in centres], [[4, 2, 1.5]] * count,
                           [[math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]] * count,
@@ -62,7 +63,7 @@ def test_best_nds_without_velocities_and_attributes_is_0_8():
 
 
 def test_one_of_four_is_recall_0_25():
-    """Of the 90 recalls above 0.1 the first 15 are reached, with precision 1."""
+    """The first 15 of the 90 recalls above 0.1 are reached, with precision 1."""
     s = scored(boxes(*ROW[:4]), boxes((10.3, 0.4), scores=0.7))
     assert s.ap == pytest.approx({0.5: 0, 1.0: 15 / 90, 2.0: 15 / 90, 4.0: 15 / 90})
     assert s.errors["ate"] == pytest.approx(0.5)
@@ -74,8 +75,8 @@ def test_recall_up_to_0_1_counts_nothing():
 
 
 def test_false_positive_of_higher_score_lowers_precision():
-    """Precision is read off between (recall 0, 0) and (1, 0.5): r / 2, of which the part above 0.1
-    is (16.2 / 90) in the mean over the recalls, out of 0.9."""
+    """Precision is interpolated between (recall 0, 0) and (1, 0.5), so it is r / 2. Above 0.1 its
+    mean over the recalls is 16.2 / 90, of at most 0.9."""
     s = scored(boxes((0, 0)), boxes((30, 0), (0, 0), scores=[0.9, 0.8]))
     assert s.mean_ap == pytest.approx(0.2)
 
@@ -86,7 +87,7 @@ def test_a_hit_is_nearer_than_the_distance():
 
 
 def test_an_object_is_found_once_and_by_the_better_score():
-    """The other one is false: at recall 1 itself precision is that of both, 0.5."""
+    """The second detection is a false positive, so precision at recall 1 is 0.5."""
     truth = boxes((0, 0))
     for first, other in ((0.2, 0.0), (0.0, 0.2)):
         s = scored(truth, boxes((first, 0), (other, 0), scores=[0.9, 0.8]))
@@ -95,7 +96,8 @@ def test_an_object_is_found_once_and_by_the_better_score():
 
 
 def test_a_detection_takes_what_is_left():
-    """The first takes the nearer object; the other, between them, the farther one, or is false."""
+    """The first takes the nearer object; the other takes the farther one, or is a false
+    positive."""
     s = scored(boxes((0, 0), (3, 0)), boxes((0.1, 0), (0.5, 0), scores=[0.9, 0.8]))
     assert s.ap == pytest.approx({**dict.fromkeys((0.5, 1.0, 2.0), (39 + 0.4 / 0.9) / 90), 4.0: 1})
 
@@ -130,8 +132,8 @@ def test_errors_of_a_pair():
 
 
 def test_error_is_a_mean_of_means_over_recall():
-    """Two objects, errors 0 and 1 by falling score. Recalls 0.11 .. 0.5 have the first error,
-    0.51 .. 1 one that rises from 0 to the mean of both, 0.5, in 50 steps."""
+    """Two objects have the errors 0 and 1, by falling score. The error is 0 at recalls 0.11 .. 0.5
+    and rises to the mean of both, 0.5, at 0.51 .. 1 in 50 steps."""
     s = scored(boxes((0, 0), (20, 0)), boxes((0, 0), (21, 0), scores=[0.9, 0.8]))
     assert s.errors["ate"] == pytest.approx(sum(0.01 * k for k in range(1, 51)) / 90)
 

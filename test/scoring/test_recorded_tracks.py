@@ -25,7 +25,8 @@ MARKERS, TRACKS = "visualization_msgs/msg/MarkerArray", "/tracker/output/tracks"
 
 @pytest.fixture(params=[True, False], ids=["with track ids", "without"])
 def recorded(request, tmp_path):
-    """A bag of the crowd, tracked; whether its labels have track ids; the last array of tracks."""
+    """Return a bag of the tracked crowd, whether its labels have track ids, and the last array of
+    tracks."""
     tracker, trails = Tracker(), Trails()
     with BagWriter(tmp_path / "bag") as bag:
         for topic in (TRUTH, TRACKS):

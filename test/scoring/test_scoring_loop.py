@@ -22,7 +22,7 @@ COUNT = 5
 
 @dataclass
 class Names:
-    """A report of what came."""
+    """A report that keeps the names of its frames."""
 
     names: list = field(default_factory=list)
     skipped: list = field(default_factory=list)
@@ -35,7 +35,7 @@ class Names:
 
 
 def counting(recording):
-    """(name, points) of a frame; nothing of 000003, which has no labels."""
+    """Return (name, number of points) of a frame; None for 000003, which has no labels."""
     return lambda frame: frame.truth() and (frame.name, len(frame.load()))
 
 

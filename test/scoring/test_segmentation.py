@@ -1,4 +1,4 @@
-"""Scores of ground and clusters: laws, cases by hand, and SemanticKITTI folders."""
+"""Scores of ground and clusters: invariants, hand-computed cases, and SemanticKITTI folders."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ CAR, VAN, TRUCK = (CLASSES.index(name) for name in ("Car", "Van", "Truck"))
 
 
 def objects(owner, region=None, near=None, counted=None, ranges=None):
-    """Objects called a, b, c, ... with the given owner of each point."""
+    """Return objects a, b, c, ... with the given owner of each point."""
     owner = np.asarray(owner, np.int32)
     region = owner if region is None else np.asarray(region, np.int32)
     count = int(owner.max(initial=0))
@@ -61,7 +61,7 @@ def report_of(cluster_ids, truth) -> dict:
 
 
 def some(seed):
-    """Labels and objects of a random frame; objects overlap clusters in every way."""
+    """Return labels and objects of a random frame, with all kinds of overlap."""
     rng = np.random.default_rng(seed)
     owner = rng.integers(0, rng.integers(1, 6), 300).astype(np.int32)
     owner = np.unique(owner, return_inverse=True)[1].reshape(-1)
@@ -136,7 +136,7 @@ def test_neutral_points_are_neutral_for_their_object_only():
 
 @pytest.mark.parametrize("counted", [0, 10, 20])
 def test_clusters_of_uncounted_points_are_not_judged(counted):
-    """The last ones, or all of them: as of labels that say of most points nothing."""
+    """Most points of a frame can be unlabelled."""
     truth = objects(np.repeat([1, 0, 2], 10), near=np.ones(30), counted=np.arange(30) < counted)
     assert score_clusters(np.repeat([1, 2, 3], 10), truth).judged == counted / 10
 
@@ -183,7 +183,7 @@ def test_nothing_found_and_nothing_to_find():
 
 
 def column(x, y, z, count):
-    """count points at x y, in heights z[0] .. z[1]."""
+    """Return `count` points at x, y and heights z[0] .. z[1]."""
     return np.column_stack([np.full(count, x), np.full(count, y), np.linspace(*z, count)])
 
 
@@ -383,7 +383,7 @@ def test_invalid_calls_name_the_reason(tmp_path):
 
 @pytest.mark.parametrize("command", [segmentation, candidates])
 def test_bag_of_a_lower_sensor_scores_equally(command, tmp_path):
-    """Its height is measured, and what is scored is told so, unless flags say another one."""
+    """The height is measured and used, unless options give another one."""
     def scores(name, lower, *flags):
         path, bag = tmp_path / f"{name}.json", tmp_path / name
         write_bag(bag, [lowered_crowd(i, lower) for i in range(3)])

@@ -1,4 +1,4 @@
-"""HOTA, CLEAR MOT and AB3DMOT's scores: the laws they keep, and a slow reading of their papers."""
+"""HOTA, CLEAR MOT and AB3DMOT's scores: invariants, and slow implementations of the papers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
 
 
 def random_sequences(seed: int) -> list[list[Pairs]]:
-    """Three sequences in which tracks follow labels, swap, fail, and others are nowhere."""
+    """Return three sequences in which tracks follow labels, swap, fail, or have no label."""
     rng = np.random.default_rng(seed)
     sequences = []
     for _ in range(3):
@@ -90,7 +90,7 @@ def test_names_of_ids_do_not_matter():
 
 
 def drive(ids=(1, 2), frames=10, switch_at=None, kind=CAR):
-    """Frames (truth, tracks) of two cars that drive side by side, found to the centimetre."""
+    """Return frames (truth, tracks) of two cars that drive side by side, tracked without error."""
     result = []
     for i in range(frames):
         boxes = np.array([[10.0 + i, y, -1.0, 4.0, 1.8, 1.5, 0.0] for y in (-3.0, 3.0)])
@@ -128,7 +128,7 @@ def test_the_order_in_which_frames_come_does_not_matter():
 
 
 def test_unnamed_drives_of_a_bag_score_like_named_ones():
-    """Labels of each have numbers of their own."""
+    """Track ids are counted separately in each drive."""
     def content(named):
         frames, found = [], {}
         for k in range(2):

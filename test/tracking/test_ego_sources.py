@@ -63,7 +63,7 @@ def test_recorded_poses_come_before_kiss_icp(monkeypatch,
 @pytest.mark.parametrize("installed", [True, False])
 @pytest.mark.parametrize("first", [0, MAX_POSE_CHECKS - 1, MAX_POSE_CHECKS, 200])
 def test_kiss_icp_replaces_poses_missing_at_the_start(monkeypatch, installed, first):
-    """No later frame is read for the choice: a bag can be an hour long."""
+    """The choice reads the first frames only, because a bag can be an hour long."""
     for module in ego, drive_tracker:
         monkeypatch.setattr(module, "has_odometry", lambda: installed)
     read = []

@@ -1,4 +1,4 @@
-"""The peer of the benchmark: births and deaths as AB3DMOT counts them, and the comparison."""
+"""The peer of the tracking benchmark: births and deaths as in AB3DMOT, and the comparison."""
 
 from __future__ import annotations
 

@@ -314,7 +314,7 @@ def test_sparse_assignment_equals_dense_one(count, overlap):
 
 
 def test_parked_cars_keep_ids_from_turning_car_without_poses():
-    """They move sideways in the sensor's frame, so their heading must not constrain the motion."""
+    """Parked cars move sideways in the sensor's frame, so heading must not constrain motion."""
     parked = np.array([car(25, 4), car(32, -6, 0.1), car(40, 5)])
     frames = [Detections.of(transform_boxes(parked, np.linalg.inv(pose(0.6 * i, 0.0, 0.02 * i))),
                             CAR,

@@ -142,8 +142,7 @@ class FusedDetector(NetworkDetector):
                                  tuple(config.high + relief), self.settings.use_intensity)
 
     def propose(self, frame: PointCloud) -> Proposals:
-        """Return the proposals for a cropped frame, whatever their score, with the evidence of all
-        sources."""
+        """Return all proposals for a cropped frame with the evidence of all sources."""
         return self._propose(self._make_view(frame))
 
     def _propose(self, wide: NormalizedView, ground: np.ndarray | None = None,
