@@ -211,9 +211,15 @@ PAGES: dict[str, dict[str, Any]] = {
         outputs=TRACKS_OUT),
     "evaluator": dict(
         params=params.EvaluatorParams(),
-        what="Scores detections against ground truth by the protocol of the STM-CPA paper.",
+        what="Scores detections against ground truth: by centre distance within 1 m while it runs, "
+             "as in the STM-CPA paper, and by KITTI's average precision at its end. In `file` the "
+             "scores of Pedestrian are at the top level, those of the other classes in `classes`, "
+             "and the average precision, of at most 10,000 frames, in `ap`.",
         inputs=[("~/input/ground_truth", MARKERS, "Labels; matched by header.stamp."),
-                ("~/input/STAGE", MARKERS, "One topic for each name in `stages`.")],
+                ("~/input/STAGE", MARKERS, "One topic for each name in `stages`."),
+                ("~/input/camera_info", "sensor_msgs/CameraInfo", "Optional, with the extrinsics: "
+                 "objects outside the image are ignored, as KITTI has no labels there."),
+                ("~/input/extrinsics", "geometry_msgs/TransformStamped", "Pose of the camera.")],
         outputs=[]),
     "bag_player": dict(
         params=params.PlayerParams(),

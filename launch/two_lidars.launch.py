@@ -20,7 +20,7 @@ from lidar_perception.nodes.launching import (
 GRAPH = Path(__file__).resolve().parent / "detectors.launch.py"
 SIDES = ("left", "right")
 SHARED = {"detectors": "candidates", "single": "false", "tracking": "false",
-          "processes": "true", "respawn": "false", "rviz": "false", "rviz_frame": "",
+          "processes": "auto", "respawn": "false", "rviz": "false", "rviz_frame": "",
           "base_frame": "", "target_frame": "", "deskew": "", "range": "", "odometry": "odom",
           "use_sim_time": "", "log_level": "info"}
 

@@ -17,6 +17,7 @@ from lidar_perception.candidates.params import (
     SeedParams,
     StmParams,
 )
+from lidar_perception.classes import DETECTED
 from lidar_perception.clustering.params import BoxParams, ClusteringParams
 from lidar_perception.ground.params import GroundParams, ObstacleParams
 from lidar_perception.param_fields import Params, param
@@ -232,5 +233,7 @@ class EvaluatorParams(Params):
                                     "the median is reported.", fixed=True)
     file: str = param("", "JSON file for the scores, written at the end and every few seconds; "
                       "empty: none.", fixed=True)
-    only_with_pedestrians: bool = param(True, "Score only frames with a Pedestrian in the ground "
-                                        "truth (protocol of the STM-CPA paper).")
+    classes: tuple[str, ...] = param(tuple(DETECTED), "Classes to score, of "
+                                     f"{', '.join(DETECTED)}.", fixed=True)
+    only_with_pedestrians: bool = param(True, "Score Pedestrian only in frames with a Pedestrian "
+                                        "in the ground truth (protocol of the STM-CPA paper).")

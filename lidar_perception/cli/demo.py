@@ -51,6 +51,7 @@ from lidar_perception.runs.terminal import console, errors, show_progress
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.scoring.recorded import RecordedResult, read_results
+from lidar_perception.tracking import tracker
 from lidar_perception.tracking.ego import NO_SOURCE
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError, class_ids
 from lidar_perception.wire.messages import read_column, to_detections, to_point_cloud, to_truth
@@ -84,9 +85,9 @@ def _runs(detector: str) -> Runs:
               help="Speed of the replay.")
 @click.option("--single", is_flag=True, help="Run ground, clusters and detector in one process "
                                              "instead of three.")
-@click.option("--processes/--one-process", default=True, show_default=True,
+@click.option("--processes/--one-process", default=None,
               help="Run each node in its own process, or all nodes in one process, which saves "
-                   "memory but is slower on loaded cores.")
+                   "memory and is the default on machines with up to four cores.")
 @click.option("--real-time", is_flag=True, help="Play at the speed of the sensor, even if the "
                                                 "machine cannot keep up. Without it each cloud is "
                                                 "sent once those before it have their results.")
@@ -94,7 +95,7 @@ def _runs(detector: str) -> Runs:
 @device_option
 @settings_options(lambda given: [_runs(given.get("detector") or FUSED)], candidates=True)
 def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: int, rate: float,
-         single: bool, processes: bool, real_time: bool, range: str, device: str,
+         single: bool, processes: bool | None, real_time: bool, range: str, device: str,
          settings: Settings) -> None:
     """Replay a drive through the real nodes over DDS, and score the detections and their tracks.
 
@@ -191,11 +192,14 @@ def _params_of(chosen: DetectorChoice, played: Recording) -> Any:
 
 
 def _code_that_compiles(chosen: DetectorChoice) -> str:
-    """Return Python code that compiles what the detector and the nodes before it run."""
+    """Return Python code that compiles what the tracker, the detector and its inputs run."""
+    lines = [f"from {tracker.__name__} import warm_up", "warm_up()"]
     if chosen.weights == CANDIDATES:
-        return f"from {warm_up.__module__} import warm_up; warm_up()"
-    return (f"from {open_detector.__module__} import open_detector; "
-            f"open_detector({chosen.weights!r}, {chosen.device!r}, range={chosen.range!r})")
+        lines += [f"from {warm_up.__module__} import warm_up", "warm_up()"]
+    else:
+        lines += [f"from {open_detector.__module__} import open_detector",
+                  f"open_detector({chosen.weights!r}, {chosen.device!r}, range={chosen.range!r})"]
+    return "; ".join(lines)
 
 
 def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:

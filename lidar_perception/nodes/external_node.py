@@ -156,8 +156,10 @@ def _localhost_discovery():
     """Limit discovery to this machine for contexts that are created inside."""
     before = os.environ.get(DISCOVERY_RANGE)
     os.environ[DISCOVERY_RANGE] = "LOCALHOST"
-    yield
-    if before is None:
-        del os.environ[DISCOVERY_RANGE]
-    else:
-        os.environ[DISCOVERY_RANGE] = before
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[DISCOVERY_RANGE]
+        else:
+            os.environ[DISCOVERY_RANGE] = before

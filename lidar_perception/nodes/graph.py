@@ -22,7 +22,8 @@ from typing import Any
 import yaml
 
 from lidar_perception.candidates.params import STEPS
-from lidar_perception.types import InputError
+from lidar_perception.runs.machine import count_cores
+from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 from lidar_perception.wire.clouds import diagnose_packets, find_cloud_topics
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
 
@@ -40,6 +41,7 @@ TRUTH_INPUT = {"~/input/ground_truth": relative_name(TRUTH)}
 CLOUDS = {"~/input/points": relative_name(POINTS)}
 ODOMETRY_INPUT = {"~/input/odometry": relative_name(ODOMETRY)}
 TRACKER = "tracker"
+MAX_CORES_FOR_ONE_PROCESS = 4
 SEPARATOR = "---"  # between the arguments of the nodes of one process
 FINAL = "final"  # the last stage of a detector, whose boxes are its detections
 CLUSTERED = {"~/input/points": "clustering/output/points"}
@@ -164,20 +166,51 @@ def cloud_topic(single: bool = False, detector: str = "candidates") -> str:
     return f"/{find_result_node(detector, single)}/output/points"
 
 
-def list_timing_topics(single: bool = False) -> list[str]:
-    """Return the topics with the times of the nodes and of their single steps."""
-    steps, last = (STEPS, "perception") if single else (STEPS[-3:], "candidate_refinement")
-    return [*(f"/{node}/debug/processing_time_ms" for node in (SINGLE if single else STAGES)),
-            *(f"/{last}/debug/{step}_ms" for step in steps)]
+def list_stages(detectors: Sequence[str], single: bool = False) -> dict[str, str]:
+    """Return the topic of detections of each stage of one detector, or of each of several."""
+    if len(detectors) == 1:
+        return list_result_topics(single, detectors[0])
+    return {name: list_result_topics(single, name)[FINAL] for name in detectors}
 
 
-def configure_evaluator(file: Path | str, single: bool = False
+def list_timing_topics(detectors: Sequence[str] = ("candidates",), single: bool = False
+                       ) -> list[str]:
+    """Return the topics with the times of the nodes, and of single steps of the candidates."""
+    topics = [f"/{node}/debug/processing_time_ms" for node in build_graph(detectors, single)]
+    if "candidates" in detectors:
+        steps, last = (STEPS, "perception") if single else (STEPS[-3:], "candidate_refinement")
+        topics += [f"/{last}/debug/{step}_ms" for step in steps]
+    return topics
+
+
+def configure_evaluator(file: Path | str, single: bool = False,
+                        detectors: Sequence[str] = ("candidates",)
                         ) -> tuple[dict[str, str], dict[str, Any]]:
-    """Return the remapping and the parameters of an evaluator of all stages."""
-    topics = list_result_topics(single)
-    remap = TRUTH_INPUT | {f"~/input/{k}": relative_name(v) for k, v in topics.items()}
-    timing = [*map(relative_name, list_timing_topics(single))]
-    return remap, {"stages": list(topics), "timing": timing, "file": str(file)}
+    """Return the remapping and the parameters of an evaluator of all stages.
+
+    The candidates alone are scored as in the STM-CPA paper: pedestrians, and all labels. Networks
+    see more than the labels, which are those of the camera image.
+    """
+    topics, only_candidates = list_stages(detectors, single), [*detectors] == ["candidates"]
+    remap = TRUTH_INPUT | ({} if only_candidates else CAMERA) | {
+        f"~/input/{k}": relative_name(v) for k, v in topics.items()}
+    timing = [*map(relative_name, list_timing_topics(detectors, single))]
+    return remap, {"stages": list(topics), "timing": timing, "file": str(file),
+                   **({"classes": [CLASSES[PEDESTRIAN]]} if only_candidates else {})}
+
+
+def runs_in_one_process(processes: str | bool | None) -> bool:
+    """Return True if the nodes of a graph run in one process.
+
+    One process takes less memory and CPU time, several use many cores better.
+
+    Args:
+        processes: one process for each node, "true" or "false"; "auto" or None: on a machine with
+            more than MAX_CORES_FOR_ONE_PROCESS cores.
+    """
+    if processes in ("auto", None):
+        return count_cores() <= MAX_CORES_FOR_ONE_PROCESS
+    return processes in ("false", False)
 
 
 def find_connected_outputs(graph: Graph) -> dict[str, set[str]]:
@@ -188,16 +221,21 @@ def find_connected_outputs(graph: Graph) -> dict[str, set[str]]:
     return {node: {t for t in subscribed if t.startswith(f"/{node}/")} for node in graph}
 
 
-def list_awaited_topics(single: bool = False, points: int = 1, truth: int = 2,
-                        detector: str = "candidates") -> list[str]:
+def list_awaited_topics(detectors: Sequence[str] = ("candidates",), single: bool = False,
+                        points: int = 1, truth: int = 1) -> list[str]:
     """Return the parameter wait_for of bag_player for a graph.
 
-    It waits for subscribers of the clouds and of the labels (the seed input and an evaluator), and
-    for one subscriber of each result and of each topic between the nodes.
+    It waits for subscribers of the clouds and of the labels, and for one subscriber of each result
+    and of each topic between the nodes.
+
+    Args:
+        points: number of subscribers of the clouds.
+        truth: number of subscribers of the labels, besides the seed input of the candidates.
     """
-    between = sorted(set().union(*find_connected_outputs(build_graph([detector], single)).values()))
+    between = sorted(set().union(*find_connected_outputs(build_graph(detectors, single)).values()))
+    truth += "candidates" in detectors
     topics = [f"{POINTS}:={points}", f"{TRUTH}:={truth}", *between,
-              *list_result_topics(single, detector).values()]
+              *(topic for name in detectors for topic in list_result_topics(single, name).values())]
     return [*map(relative_name, topics)]
 
 

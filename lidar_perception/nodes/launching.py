@@ -35,6 +35,7 @@ from lidar_perception.nodes.graph import (
     find_expert_range,
     find_trackers,
     relative_name,
+    runs_in_one_process,
 )
 from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.nodes.param_files import (
@@ -90,9 +91,9 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
                      "the trackers and deskew."),
     "single": dict(**SWITCHES, description="Run each detector in one process that finds ground and "
                    "clusters itself."),
-    "processes": dict(default_value="true", choices=["true", "false"], description="true: one "
-                      "process for each node; false: one process for all nodes, which saves memory "
-                      "but is slower on loaded cores."),
+    "processes": dict(default_value="auto", choices=["auto", "true", "false"], description="true: "
+                      "one process for each node; false: one process for all nodes, which saves "
+                      "memory; auto: one process on machines with up to four cores."),
     "autostart": dict(default_value="true", choices=["true", "false"], description="false: a "
                       "lifecycle manager configures and activates the nodes."),
     "respawn": dict(**SWITCHES, description="Restart a node that has ended, for example after a "
@@ -204,7 +205,7 @@ def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
         # A parameter file may make any node read odometry; for the others the remapping is void.
         remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_INPUT}.items()],
     ) for node, remap in graph.items()]
-    if len(nodes) > 1 and value["processes"] == "false":
+    if len(nodes) > 1 and runs_in_one_process(value["processes"]):
         words = [word for node in nodes for word in (SEPARATOR, *_list_arguments(**node))]
         return [*viewer, Node(executable=words[1], arguments=[*words[2:], SEPARATOR],
                               exec_name="graph", **common)]
@@ -308,7 +309,12 @@ def _list_expert_range(value: dict[str, str], files: dict[str, list[str]]) -> li
 
 
 def _detectors(value: dict[str, str]) -> list[str]:
-    detectors = [name.strip() for name in value["detectors"].split(",") if name.strip()]
+    return split_detectors(value["detectors"])
+
+
+def split_detectors(text: str) -> list[str]:
+    """Return the names in a comma-separated list; raise InputError if it is empty."""
+    detectors = [name.strip() for name in text.split(",") if name.strip()]
     if not detectors:
         raise InputError(f"detectors is empty; give one or more of {','.join(DETECTOR_NODES)}")
     return detectors

@@ -286,8 +286,7 @@ def test_without_rclpy_the_remedy_is_said_before_any_work(command, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_demo_tells_its_nodes_how_high_the_sensor_is(tmp_path):
-    """As measured in the bag that it replays, which says nothing of it."""
+def test_demo_passes_the_measured_sensor_height_to_its_nodes(tmp_path):
     write_bag(tmp_path / "bag", [lowered_crowd(i, 1.0) for i in range(3)])
     recording = open_and_describe(tmp_path / "bag")
     played = _as_replayed(recording.path, recording)

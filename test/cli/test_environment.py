@@ -76,7 +76,7 @@ def test_concurrent_first_calls_make_one_environment(tmp_path):
 
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
 def test_a_sourced_ros_is_not_seen_while_the_environment_is_made(tmp_path):
-    """pip leaves out what it finds on PYTHONPATH."""
+    """pip does not install packages that it finds on PYTHONPATH."""
     seen = tmp_path / "seen"
     python = write(tmp_path / "python", f"#!/bin/sh\necho ${{PYTHONPATH-unset}} >>{seen}\n")
     python.chmod(0o755)

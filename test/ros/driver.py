@@ -34,6 +34,6 @@ for i in range(count):
     sleep(max(0.0, start + i / hz - monotonic()))
     publisher.publish(cloud)
 print("sent", flush=True)
-sys.stdin.readline()  # what is resent to a reliable subscriber needs a writer that lives
+sys.stdin.readline()  # keeps the writer alive, which may resend clouds to reliable subscribers
 node.destroy_node()
 rclpy.try_shutdown()

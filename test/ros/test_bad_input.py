@@ -30,7 +30,7 @@ def peer(shared_peer):
 
 @pytest.fixture(scope="module")
 def send(shared_processes, peer):
-    """send(node, cloud, condition, what) until the condition holds; each node has its own topic."""
+    """Return send(node, cloud, condition, what): it sends until the condition holds."""
     nodes = "ground_segmentation", "perception", "clustering", "candidate_refinement"
     talkers = {node: peer.advertise(f"/{node}/input/points", CLOUD) for node in nodes}
     for node in nodes:
@@ -40,28 +40,28 @@ def send(shared_processes, peer):
 
 @pytest.fixture(scope="module")
 def results(peer):
-    """Node -> the clouds that it sends."""
+    """Return {node: the clouds that it has published}."""
     return {node: peer.listen(f"/{node}/output/points", CLOUD)
             for node in ("ground_segmentation", "perception")}
 
 
 @pytest.fixture(scope="module")
-def serve(send, results):
-    """Sends a cloud and gives what a node makes of it: what came before is done then."""
-    def served(node, msg):
+def process(send, results):
+    """Return a function that sends a cloud to a node and returns the cloud that it publishes."""
+    def processed(node, msg):
         stamp, received = to_ns(msg.header.stamp), results[node]
         send(node, msg, lambda: received and to_ns(received[-1].header.stamp) == stamp,
              "the cloud's result")
         return received[-1]
-    return served
+    return processed
 
 
 @pytest.mark.parametrize("node", ["ground_segmentation", "perception"])
-def test_bad_clouds_become_diagnostics_and_the_node_lives_on(node, send, serve, peer, good_cloud):
+def test_bad_clouds_become_diagnostics_and_node_continues(node, send, process, peer, good_cloud):
     for name, (msg, words) in BAD.items():
         peer.diagnostics.clear()
         send(node, msg, lambda w=words: w in peer.get_message(node), f"'{words}': {name}")
-    result = serve(node, good_cloud)
+    result = process(node, good_cloud)
     assert result.width == good_cloud.width
     names = [f.name for f in result.fields]
     assert names[:4] == ["x", "y", "z", "intensity"] and "ground" in names
@@ -71,9 +71,9 @@ def test_bad_clouds_become_diagnostics_and_the_node_lives_on(node, send, serve, 
     {"ground.method": "patchwork"}, {"ground.method": "cloth"},
     {"ground.method": "cloth", "clustering.method": "euclidean", "boxes.shape": "l_shape"},
 ], ids=["patchwork", "cloth", "paper C"])
-def test_no_method_dies_of_a_strange_cloud(values, send, serve, results, shared_processes, peer,
-                                           good_cloud):
-    """The wheels behind some methods end the process on NaN, outliers or nothing at all."""
+def test_every_method_survives_invalid_clouds(
+        values, send, process, results, shared_processes, peer, good_cloud):
+    """Some libraries crash on NaN, outliers or empty clouds."""
     node = "perception" if "clustering.method" in values else "ground_segmentation"
     rng = np.random.default_rng(0)
     xyz = xyz_of(good_cloud)
@@ -92,37 +92,37 @@ def test_no_method_dies_of_a_strange_cloud(values, send, serve, results, shared_
     with peer.parameters(f"/{node}", values):
         for stamp, msg in enumerate(strange.values(), start=10):
             send(node, msg, lambda: True, "a subscriber")
-            serve(node, cloud(some, stamp))
+            process(node, cloud(some, stamp))
     assert {r.width for r in results[node][before:]} >= {1_000_000, len(xyz), 2001}
     assert "PatchWork" not in shared_processes.read_log(node)
 
 
-def test_a_wrong_height_and_a_wrong_scale_of_intensity_are_said(send, peer, good_cloud):
-    """The sensor hangs 1.73 m high; intensity is 0..1."""
-    def said(words):
+def test_wrong_height_and_intensity_scale_are_reported(send, peer, good_cloud):
+    """The sensor is mounted at 1.73 m; intensity is 0..1."""
+    def is_reported(words):
         send(node, good_cloud, lambda: words in peer.get_message(node), words)
 
     node = "ground_segmentation"
     with peer.parameters(f"/{node}", {"ground.method": "patchwork",
                                       "ground.sensor_pose.height": 1.2}):
-        said("ground.sensor_pose.height is 1.2; set it to 1.7")
+        is_reported("ground.sensor_pose.height is 1.2; set it to 1.7")
         with peer.parameters(f"/{node}", {"ground.sensor_pose.height": 1.73,
                                           "input.intensity_max": 0.001}):
-            said("input.intensity_max")
-    said("segmenting")
+            is_reported("input.intensity_max")
+    is_reported("segmenting")
     assert peer.get_message(node) == "segmenting"
     assert abs(float(peer.get_value(node, "sensor_height")) - 1.73) < 0.1
     assert 0.5 < float(peer.get_value(node, "plane_inlier_share")) <= 1.0
 
 
-def test_layout_does_not_change_the_result(serve, good_cloud):
+def test_layout_does_not_change_the_result(process, good_cloud):
     """Big-endian, organised and NaN-padded clouds give the ground of the plain cloud."""
     xyz = xyz_of(good_cloud)[:40_000]
     holes = np.full((20_000, 3), np.nan, np.float32)
     organised = cloud(np.concatenate([xyz, holes, np.zeros_like(holes)]), 103, is_dense=False)
     organised.height, organised.width = 8, 10_000
     organised.row_step = organised.width * organised.point_step
-    clouds = [serve("ground_segmentation", msg) for msg in (cloud(xyz, 101), big_endian(xyz, 102),
+    clouds = [process("ground_segmentation", msg) for msg in (cloud(xyz, 101), big_endian(xyz, 102),
                                                             organised)]
     plain, big, grid = (to_array(msg)["ground"] for msg in clouds)
     assert plain.sum() > 1000
@@ -140,14 +140,14 @@ def test_clustering_and_refinement_name_the_missing_column(send, peer, good_clou
 def test_diagnostics_report_missing_camera_and_seed(
         send, peer, good_cloud, drive_bag):
     """view.enabled without CameraInfo; then without a seed; then with a clicked pedestrian."""
-    def said(words):
+    def is_reported(words):
         send("perception", good_cloud, lambda: words in peer.get_message("perception"), words)
 
     with peer.parameters("/perception", {"seed.source": "click"}):
         with peer.parameters("/perception", {"view.enabled": True, "input.max_wait": 0.5}):
-            said("camera calibration")
+            is_reported("camera calibration")
         found = peer.listen("/perception/output/detections", MARKERS)
-        said("no seed yet")
+        is_reported("no seed yet")
         peer.wait(lambda: found, "candidates")
         assert len(from_marker_array(found[-1])) == 0
 
@@ -159,7 +159,7 @@ def test_diagnostics_report_missing_camera_and_seed(
             clicked = bag_message("geometry_msgs/msg/PointStamped", point=point,
                                   header=make_header(0, frame_id, bag_message))
             peer.send(click, clicked, click.get_subscription_count, "a subscriber of the click")
-            said(words)
+            is_reported(words)
         peer.wait(lambda: len(from_marker_array(found[-1])), "candidates, which may come late")
     objects = from_marker_array(found[-1])
     assert_detections(objects, [("Pedestrian", nearest)], max_extra=None)

@@ -38,7 +38,7 @@ def test_demo_scores_the_offline_result_in_one_process_and_in_many(drive_bag, ma
     fused = open_detector(sensor_height=next(iter(frames.values())).sensor_height)
     expected = {stamp: fused(frame.load()).detections for stamp, frame in frames.items()}
     tracks = []
-    for name, arguments in ("one", ["--one-process"]), ("many", []):
+    for name, arguments in ("one", ["--one-process"]), ("many", ["--processes"]):
         out = tmp_path / name
         outcome = CliRunner().invoke(demo, ["--data", str(bag), *arguments, "--out", str(out)])
         assert outcome.exit_code == 0, outcome.output

@@ -1,4 +1,4 @@
-"""Clouds that are moved to their stamp in the nodes, each in this process, by odometry or TF."""
+"""Motion compensation in the nodes, by odometry or TF."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from robot_messages import PERIOD, START, give, message, mounted, odometry, problems, transforms
+from robot_messages import PERIOD, START, give, message, mount_pose, odometry, problems, transforms
 
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.robot.deskew import make_constant_motion, skew
@@ -20,17 +20,17 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def drive(at_ns):
-    """The base's pose in odom: 15 m/s on a left turn."""
+    """Return the pose of the base in odom: 15 m/s on a left turn."""
     return make_constant_motion([15.0, 0.0, 0.0],
                                 [0.0, 0.0, 0.5])(np.array([(at_ns - START) * 1e-9]))[0]
 
 
 @pytest.mark.parametrize("source", ["odometry", "tf"])
-def test_a_cloud_of_a_moving_sensor_is_moved_to_its_stamp(start, source):
-    """Later nodes get the moved points, all at the stamp; the robot's own body stays where it is;
-    without odometry the cloud is used as it is, and this is said."""
+def test_cloud_of_moving_sensor_is_compensated(start, source):
+    """Later nodes get the compensated points; those of the robot's body stay. Without odometry the
+    cloud is used uncompensated, with a warning."""
     rng = np.random.default_rng(0)
-    sensor = mounted(1.2, 0.1, 1.8, 0.5, 0.0, 0.0)
+    sensor = mount_pose(1.2, 0.1, 1.8, 0.5, 0.0, 0.0)
     still = np.vstack([rng.uniform(-30, 30, (3000, 3)) * [1, 1, 0.001] - [0, 0, 1.8],
                        rng.uniform(-0.5, 0.5, (50, 3)) + [-1.0, 0, -0.6]]).astype(np.float32)
     body = np.arange(3000, 3050)
@@ -101,8 +101,8 @@ def test_first_cloud_waits_for_odometry_of_its_whole_turn(start):
 @pytest.mark.parametrize("first, begin, sectors", [(0.3, 0.0, ()), (1.0, -1.0, (120.0, 240.0))])
 def test_later_clouds_wait_for_the_end_of_their_turn(start, first, begin,
                                                      sectors):
-    """A part of a turn, where the driver starts in the middle of one; or one that is stamped at its
-    end, near which points are cropped. The odometry comes every 0.02 s."""
+    """The first turn is partial, or the stamp is at the end of a turn, with cropped points there.
+    Odometry comes every 0.02 s."""
     node = start(GroundSegmentation, **{"input.deskew": "odometry", "crop.sectors": sectors})
     deliver = node._receptions()[0].deliver
     heard = iter(range(START, START + 20 * PERIOD, PERIOD // 5))
@@ -121,4 +121,4 @@ def test_later_clouds_wait_for_the_end_of_their_turn(start, first, begin,
             known = hear()
         while deliver(encode(message(xyz, stamp, time=seconds.astype("<f4"))), True):
             known = hear()
-    assert node.counts["deskewed"] == 7 - (first < 1.0)  # the second cannot know
+    assert node.counts["deskewed"] == 7 - (first < 1.0)  # the duration is unknown at the second

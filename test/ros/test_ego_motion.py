@@ -1,5 +1,4 @@
-"""Where trackers in nodes, each in this process, have the sensor's motion from, against the library
-with the poses that were meant."""
+"""Sensor poses of the tracker in nodes, compared with the library run on the true poses."""
 
 from __future__ import annotations
 
@@ -9,7 +8,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from rclpy.parameter import Parameter
-from robot_messages import message, mounted, odometry, transforms, walker
+from robot_messages import message, mount_pose, odometry, transforms, walker
 from tracking_samples import START, TENTH, crowd, pose
 
 from lidar_perception.classes import CAR, CYCLIST, PEDESTRIAN
@@ -29,7 +28,7 @@ from lidar_perception.wire.messages import make_detection_markers, to_class_ids
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import make_header
 
-SENSOR = mounted(1.2, 0.3, 1.8, 0.6, 0.0, 0.0)  # on the base
+SENSOR = mount_pose(1.2, 0.3, 1.8, 0.6, 0.0, 0.0)  # on the base
 
 
 def base_at(i):
@@ -45,8 +44,10 @@ def tracked(node):
 
 
 def drive(node, tell, poses, frame_id="lidar"):
-    """Frames of a crowd, as a sensor at poses (K, 4, 4) sees it, to the node after tell(i, stamp);
-    its tracks are those of the library with `poses`."""
+    """Send a node frames of a crowd, seen from poses (K, 4, 4), and compare with the library.
+
+    tell(i, stamp) is called before each frame.
+    """
     library = Tracker()
     for i, (found, at) in enumerate(zip(crowd(frames=len(poses)), poses)):
         stamp = START + i * TENTH
@@ -63,7 +64,7 @@ def drive(node, tell, poses, frame_id="lidar"):
 
 @pytest.mark.parametrize("source", ["odometry", "tf", "auto"])
 def test_odometry_is_transformed_to_the_sensor(start, source):
-    """By TF from what the odometry is of to the sensor, or all of it by TF."""
+    """With odometry, TF gives the mount of the sensor; without it, the whole pose."""
     node = start(TrackerNode, **{"ego.source": source})
     node.transforms.on_tf(transforms(("base", "lidar", SENSOR, 0)), static=True)
 
@@ -96,7 +97,7 @@ def test_missing_odometry_to_sensor_transform_is_reported(start):
     assert min(tracked(node).ids) > 6  # the poses are others from here on: all tracks ended
 
 
-def test_what_tf_lacks_is_named(start):
+def test_missing_transform_is_named(start):
     node = start(TrackerNode, **{"ego.source": "tf", "input.fixed_frame": "map"})
     node.on_markers(make_detection_markers(next(crowd()), header(START), bag_message))
     assert "TF does not connect 'lidar' with 'map'" in node.state[1]
@@ -109,7 +110,7 @@ def test_auto_falls_back_to_scans_and_returns_to_poses(
         pytest.skip("needs kiss-icp, the extra [odometry]")
     node = start(TrackerNode)
     found = node._receptions()[0]
-    xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
+    xyz, _ = walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
 
     def frames(first, count):
         for i in range(first, first + count):
@@ -136,15 +137,15 @@ def test_auto_falls_back_to_scans_and_returns_to_poses(
             node.transforms.on_tf(transforms(("odom", "lidar", base_at(i), stamp)), static=False)
     frames(14, 2)
     assert node.counts["ego"] == better and min(tracked(node).ids) > before
-    assert ICP_MS not in node.counts  # it costs nothing any more
+    assert ICP_MS not in node.counts  # scans are not registered any more
 
 
 def test_detector_cloud_waits_for_its_pose_with_timeout(start):
     node = start(Perception, **{"tracking.enabled": True, "ego.max_wait": 100.0})
     deliver = node._receptions()[0].deliver
-    xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
+    xyz, _ = walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     clouds = [encode(message(xyz, START + i * TENTH)) for i in range(20)]
-    assert deliver(clouds[0], True) is None  # nobody sends poses so far
+    assert deliver(clouds[0], True) is None  # no pose yet
     node.transforms.on_odometry(odometry(base_at(0), START, "lidar"))
     assert deliver(clouds[1], True) == "the pose of its time"
     node.transforms.on_odometry(odometry(base_at(1), START + TENTH, "lidar"))
@@ -152,16 +153,16 @@ def test_detector_cloud_waits_for_its_pose_with_timeout(start):
     np.testing.assert_allclose(node.outputs.final.tracks.tracker.pose, base_at(1), atol=1e-9)
     assert deliver(clouds[2], True) == "the pose of its time"
     assert node.set_parameters([Parameter("ego.max_wait", value=0.0)])[0].successful
-    assert deliver(clouds[2], True) is None  # it has waited for long enough
+    assert deliver(clouds[2], True) is None  # the time to wait is over
     assert deliver(clouds[19], True) is None  # the odometry has stopped
     assert len(node.sent["tracks"]) == 4
 
 
-def test_an_empty_cloud_is_answered_and_the_scans_go_on(start):
+def test_empty_cloud_is_answered_and_scan_poses_continue(start):
     if not has_odometry():
         pytest.skip("needs kiss-icp, the extra [odometry]")
     node = start(Perception, **{"tracking.enabled": True, "ego.source": "kiss_icp"})
-    xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
+    xyz, _ = walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     for i in range(6):
         node._receptions()[0].deliver(encode(message(xyz[:0] if i == 3 else xyz,
                                                      START + i * TENTH)), False)
@@ -170,7 +171,7 @@ def test_an_empty_cloud_is_answered_and_the_scans_go_on(start):
 
 
 def test_late_poses_delay_frames_by_max_wait_once(start, monkeypatch):
-    """A newer cloud takes the place of one that waits, so that none waits for long by itself."""
+    """A newer cloud replaces a waiting one."""
     node, now = start(TrackerNode), [100.0]
     monkeypatch.setattr(ego_module, "monotonic", lambda: now[0])
     ego, wait = node.tracks.ego, node.params.ego.max_wait
@@ -192,22 +193,22 @@ def test_stopped_or_foreign_clock_odometry_is_reported(start, monkeypatch):
         monkeypatch.setattr(module, "monotonic", lambda: now[0])
     found = node._receptions()[0]
 
-    def said(seconds):
+    def report(seconds):
         stamp = header(START + round(seconds * 10 * TENTH))
         found.deliver(encode(make_detection_markers(next(crowd()), stamp, bag_message)), False)
         return node.state[1]
 
     node.transforms.on_odometry(odometry(base_at(0), START + 1000 * 10 * TENTH, "lidar"))
-    assert "1000 s ahead of the detections" in said(0) and "same clock" in node.state[1]
+    assert "1000 s ahead of the detections" in report(0) and "same clock" in node.state[1]
     node.transforms.on_odometry(odometry(base_at(0), START, "lidar"))
     now[0] += 5.0
-    said(2)  # the first seconds are the tracker's, which goes on as before
-    assert "no odometry on /tracker/input/odometry for 5 s" in said(2.1)
+    report(2)  # the tracker continues for the first seconds
+    assert "no odometry on /tracker/input/odometry for 5 s" in report(2.1)
 
 
 @pytest.mark.parametrize("source, lag", [("odometry", 3.0), ("tf", 0.7)])
-def test_a_source_that_is_always_too_late_is_named(start, source, lag):
-    """Longer than ego.max_gap, and less than what tells another clock."""
+def test_source_that_is_always_late_is_named(start, source, lag):
+    """The lag is longer than ego.max_gap and too short for a different clock."""
     node = start(TrackerNode, **{"ego.source": source})
     for i in range(15):
         stamp = START + i * TENTH
@@ -226,12 +227,12 @@ def test_first_of_two_odometry_publishers_is_used(
     node, now = start(TrackerNode), [100.0]
     monkeypatch.setattr(transforms_module, "monotonic", lambda: now[0])
 
-    def told(i, stamp):
+    def send_odometry(i, stamp):
         node.transforms.on_odometry(odometry(base_at(i), stamp, "lidar"))
         if i % 2:
             node.transforms.on_odometry(odometry(base_at(3 * i), stamp + 1, "lidar", "map"))
 
-    drive(node, told, [base_at(i) for i in range(8)])
+    drive(node, send_odometry, [base_at(i) for i in range(8)])
     assert "of 'lidar' in 'map' is ignored" in node.transforms.problems()[0][2]
     now[0] += transforms_module.ODOMETRY_TIMEOUT_S + 1
     node.transforms.on_odometry(odometry(base_at(0), START + 10 * TENTH, "lidar", "map"))
@@ -248,11 +249,11 @@ def test_odometry_without_child_frame_is_ignored(start):
 
 
 def test_scan_poses_are_converted_to_detection_frame(start):
-    """Who looks to the rear goes backwards; without a way between the frames nothing is claimed."""
+    """A sensor that looks to the rear moves backwards; without a transform there is no pose."""
     if not has_odometry():
         pytest.skip("needs kiss-icp, the extra [odometry]")
     node = start(TrackerNode, **{"ego.source": "kiss_icp"})
-    ego, rear = node.tracks.ego, mounted(-1.0, 0.2, 1.8, np.pi, 0.0, 0.0)
+    ego, rear = node.tracks.ego, mount_pose(-1.0, 0.2, 1.8, np.pi, 0.0, 0.0)
     xyz, _ = walker(SENSOR)
     for i in range(3):
         ego._on_cloud(message(xyz, START + i * TENTH))
@@ -262,7 +263,7 @@ def test_scan_poses_are_converted_to_detection_frame(start):
     np.testing.assert_allclose(ego.find_pose(header(START, "base")),
                                ego.find_pose(header(START)) @ invert_pose(rear), atol=1e-6)
     assert ego.find_problem("base", START) is None
-    for late in (0, 1):  # once more, or between two drivers' queues: the map stays
+    for late in (0, 1):  # repeated, or late from the queue of another driver: the map stays
         ego._on_cloud(message(xyz, START + (2 - late) * TENTH))
     assert ego.icp_restarts == 1
     ego._on_cloud(message(xyz, START + 10**11))  # another map, with another origin

@@ -1,4 +1,4 @@
-"""The evaluator between nodes that are late, elsewhere, or two."""
+"""The evaluator node: late, lost and repeated messages, other frames, and all classes."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from tracking_samples import START, TENTH, crowd
 
+from lidar_perception.camera import Calibration
 from lidar_perception.nodes.replay.evaluator import MAX_INCOMPLETE_FRAMES, Evaluator
-from lidar_perception.types import InputError
+from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import make_detection_markers
+from lidar_perception.wire.messages import make_camera_info, make_detection_markers, make_extrinsics
+from lidar_perception.wire.topics import CAMERA_FRAME
 from msg_utils.stamps import make_header
 
 
@@ -23,7 +25,7 @@ def array(number, frame_id="lidar"):
                                                              bag_message), bag_message)
 
 
-def said(node):
+def list_problems(node):
     return " ".join(message for _, _, message in node.problems())
 
 
@@ -40,7 +42,7 @@ def test_labels_may_be_late_and_lost_frames_count_once(start, late):
     assert node.counts["incomplete"] + len(node.waiting) == given_up
 
 
-def test_all_detections_before_all_labels_leave_those_that_wait(start):
+def test_detections_wait_for_their_labels_up_to_a_limit(start):
     node = start(Evaluator)
     for name in "final", "ground_truth":
         for i in range(MAX_INCOMPLETE_FRAMES + 30):
@@ -51,7 +53,7 @@ def test_all_detections_before_all_labels_leave_those_that_wait(start):
         node.state[1] == "scoring")
 
 
-def test_a_file_that_cannot_be_written_is_said_and_tried_again(start, tmp_path):
+def test_file_error_is_reported_and_writing_retried(start, tmp_path):
     folder = tmp_path / "scores"
     with pytest.raises(InputError, match="give the path of a file"):
         start(Evaluator, file=str(tmp_path))
@@ -59,29 +61,76 @@ def test_a_file_that_cannot_be_written_is_said_and_tried_again(start, tmp_path):
     node._add_time("detector", float("nan"))
     folder.write_text("a file where the folder should be")
     node.write()
-    assert "cannot write" in said(node) and "retrying" in said(node)
+    assert "cannot write" in list_problems(node) and "retrying" in list_problems(node)
     with pytest.raises(InputError, match="the scores are lost"):
         node.close()
     folder.unlink()
     node.close()
-    assert said(node) == "" and json.loads((folder / "scores.json").read_text())
+    assert list_problems(node) == "" and json.loads((folder / "scores.json").read_text())
 
 
-def test_boxes_of_other_frames_are_scored_and_said(start):
+def test_boxes_in_other_frames_are_scored_with_a_warning(start):
     node = start(Evaluator)
     node._add("ground_truth", array(0, "velo"))
     node._add("final", array(0, "odom"))
     assert node.counts["frames"] == 1
-    assert "ground_truth in 'velo'" in said(node) and "final in 'odom'" in said(node)
+    for words in "ground_truth in 'velo'", "final in 'odom'":
+        assert words in list_problems(node)
     node._add("ground_truth", array(1))
     node._add("final", array(1))
-    assert said(node) == "" and np.isfinite(float(node.counts["F1 of final"]))
+    assert list_problems(node) == "" and np.isfinite(float(node.counts["F1 of final"]))
+
+
+def objects(stamp, cars=(), cyclists=(), pedestrians=()):
+    """Return markers of objects at the given distances ahead, 2 m apart to the left."""
+    rows = [[x, 2.0 * i, -0.9, *size, 0.0, CLASSES.index(name)] for name, size, found in (
+        ("Car", (4, 2, 1.5), cars), ("Cyclist", (1.8, 0.6, 1.7), cyclists),
+        ("Pedestrian", (0.8, 0.6, 1.7), pedestrians)) for i, x in enumerate(found)]
+    boxes = np.array(rows, float).reshape(-1, 8)
+    return make_detection_markers(
+        Detections.of(boxes[:, :7], boxes[:, 7].astype(int), np.full(len(boxes), 0.9)),
+        make_header(stamp, "lidar", bag_message), bag_message)
+
+
+@pytest.mark.parametrize("with_camera", [False, True])
+def test_all_classes_are_scored_and_precision_at_the_end(with_camera, start, tmp_path):
+    file = tmp_path / "scores.json"
+    node = start(Evaluator, file=str(file))
+    if with_camera:
+        camera = Calibration(np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
+                             np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]),
+                             1200, 370)
+        header = make_header(0, CAMERA_FRAME, bag_message)
+        node.camera_info = make_camera_info(camera, header, bag_message)
+        node.extrinsics = make_extrinsics(camera, make_header(0, "lidar", bag_message), bag_message)
+    frames = [  # labels and detections
+        (dict(cars=[20, -20], pedestrians=[10]), dict(cars=[20, -30], pedestrians=[10, 30])),
+        (dict(cars=[15], cyclists=[12]), dict(cars=[15], pedestrians=[9])),
+        (dict(pedestrians=[8]), dict(pedestrians=[8], cyclists=[14]))]
+    for i, (truth, found) in enumerate(frames):
+        node._add("ground_truth", objects(START + i, **truth))
+        node._add("final", objects(START + i, **found))
+    node.close()
+    content = json.loads(file.read_text())
+
+    def counts(result):
+        row = result["final"]["all"]
+        return result["frames"], row["tp"], row["fp"], row["fn"]
+
+    behind = int(not with_camera)  # the car behind is outside the image
+    assert counts(content) == (2, 2, 1, 0)  # not in the frame without a pedestrian
+    assert counts(content["classes"]["Car"]) == (3, 2, behind, behind)
+    assert counts(content["classes"]["Cyclist"]) == (3, 0, 1, 1)
+    assert content["ap"]["final"]["Pedestrian"]["3d"]["easy"]["r40"] == 50
+    assert ("image" in content["ap"]["final"]["Car"]) == with_camera
+    assert node.counts["F1 of final, Car"] == ("1.000" if with_camera else "0.667")
 
 
 @pytest.mark.parametrize("values, words", [
+    ({"classes": ["Cart"]}, "no class 'Cart'; did you mean 'Car'"),
     ({"stages": ["ground_truth"]}, "must be distinct names"),
     ({"stages": ["a", "a"]}, "must be distinct names"),
     ({"timing": ["foo"]}, "not of the form")])
-def test_parameters_with_which_nothing_is_scored_are_refused(start, values, words):
+def test_unusable_parameters_are_refused(start, values, words):
     with pytest.raises(InputError, match=words):
         start(Evaluator, **values)

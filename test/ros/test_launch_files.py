@@ -1,81 +1,39 @@
-"""Nodes and parameters that the launch files start, with stand-ins for launch and launch_ros."""
+"""Nodes and parameters that the launch files start, with a stand-in for launch and launch_ros."""
 
 from __future__ import annotations
 
 import ast
-import importlib.util
+import importlib
 import re
-import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 
 import pytest
+from launch_stand_in import Launch, install
 
-from lidar_perception.nodes.graph import build_graph
+from lidar_perception.nodes import graph as graph_module
+from lidar_perception.nodes.graph import build_graph, find_result_node
 from lidar_perception.nodes.main import split_arguments
 from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.nodes.param_files import read_sections
 from lidar_perception.types import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
-SHARED = "lidar_perception.nodes.launching"
-STAND_INS = {"launch": ["LaunchDescription"],
-             "launch.actions": ["DeclareLaunchArgument", "EmitEvent", "IncludeLaunchDescription",
-                                "LogInfo", "OpaqueFunction", "RegisterEventHandler",
-                                "TimerAction"],
-             "launch.event_handlers": ["OnProcessExit"], "launch.events": ["Shutdown"],
-             "launch.launch_description_sources": ["PythonLaunchDescriptionSource"],
-             "launch.substitutions": ["LaunchConfiguration"], "launch_ros": [],
-             "launch_ros.actions": ["Node"]}
-
-
-class Recorded(SimpleNamespace):
-    """What a launch file asked for."""
-
-    def __init__(self, *args, **options):
-        super().__init__(args=args, **options)
 
 
 @pytest.fixture
-def description(monkeypatch):
-    """name of a launch file -> its actions."""
-    for name, kinds in STAND_INS.items():
-        module = ModuleType(name)
-        for kind in kinds:
-            setattr(module, kind, Recorded)
-        monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.setitem(sys.modules, SHARED, None)  # forgotten again after the test
-    del sys.modules[SHARED]
+def launched(monkeypatch):
+    """Return a function that executes a launch file: launched(name)(**arguments) is {name: node}.
+
+    Its attribute `messages` has the log of the last call.
+    """
+    install(monkeypatch)
 
     def load(name):
-        spec = importlib.util.spec_from_file_location(
-            name, ROOT / "launch" / f"{name}.launch.py")
-        file = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(file)
-        return file.generate_launch_description().args[0]
-    return load
-
-
-@pytest.fixture
-def launched(description):
-    """name of a launch file -> its arguments with their defaults, and a function that gives its
-    nodes by name for arguments that are given."""
-    def load(name):
-        described = description(name)
-        arguments = {a.args[0]: a.default_value for a in described if hasattr(a, "default_value")}
-        start = next(a.function for a in described if hasattr(a, "function"))
-
         def nodes(**given):
-            assert set(given) <= set(arguments)
-            context = SimpleNamespace(
-                perform_substitution=lambda s: {**arguments, **given}[s.args[0]])
-            actions = start(context)
-            said[:] = [a.msg for a in actions if hasattr(a, "msg")]
-            return {n.name if n.executable == "tracker" else n.executable: n
-                    for n in actions if hasattr(n, "executable")}
-        said: list[str] = []
-        nodes.said = said  # by the last call
-        return arguments, nodes
+            launch = Launch(name, {"processes": "true"} | given)
+            nodes.messages = launch.messages
+            return {n.name if n.executable == "tracker" else n.executable: n for n in launch.nodes}
+        return nodes
     return load
 
 
@@ -85,8 +43,8 @@ SEVERAL = "candidates,pointpillars,pointnet"
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched):
-    _, nodes = launched(name)
+def test_launch_file_starts_its_graph_or_single_detectors(name, launched):
+    nodes = launched(name)
     detectors = FILES[name].split(",")
     config = str(ROOT / "config" / f"{'fused' if name == 'detectors' else name}.param.yaml")
     started = nodes(points="/cloud", use_sim_time="true", log_level="debug", reliability="reliable")
@@ -103,10 +61,9 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
             assert node.parameters[0] == config
     assert not any(node.respawn for node in started.values())
     again = nodes(respawn="true", rviz="true", tracking="true")
-    assert all(hasattr(node, "respawn") == (kind != "rviz2") for kind, node in again.items())
-    assert all(node.respawn for kind, node in again.items() if kind != "rviz2")
+    assert all(node.respawn == (kind != "rviz2") for kind, node in again.items())
     for node in nodes(autostart="false").values():
-        assert node.parameters[1] == {"autostart": False}  # what is not given, the file may say
+        assert node.parameters[1] == {"autostart": False}  # other parameters are those of the file
     mine = str(ROOT / "config" / "best.param.yaml")
     for node in nodes(config=mine, tracking="true").values():  # on top of the package's own
         assert node.parameters[0] != node.parameters[1] == mine
@@ -120,9 +77,12 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
         nodes(ahead="left")
 
 
-@pytest.mark.parametrize(("processes", "together"), [("true", False), ("false", True)])
-def test_graph_is_one_process_on_request(processes, together, launched):
-    _, nodes = launched("detectors")
+@pytest.mark.parametrize(("processes", "cores", "together"), [
+    ("true", 2, False), ("false", 16, True), ("auto", 4, True), ("auto", 5, False)])
+def test_graph_is_one_process_on_request_or_on_few_cores(processes, cores, together, launched,
+                                                         monkeypatch):
+    monkeypatch.setattr(graph_module, "count_cores", lambda: cores)
+    nodes = launched("detectors")
     given = dict(processes=processes, tracking="true", namespace="left", range="around",
                  points="/cloud", log_level="debug", respawn="true")
     started = nodes(**given)
@@ -155,7 +115,7 @@ def test_graph_is_one_process_on_request(processes, together, launched):
     ("fused", {"config": "fused.range: around"}, "around"),
     ("fused", {"config": "range: all"}, None)])
 def test_experts_have_the_range_of_the_detectors(detectors, given, expected, launched, tmp_path):
-    _, nodes = launched("detectors")
+    nodes = launched("detectors")
     if "config" in given:
         mine = tmp_path / "mine.yaml"
         mine.write_text(f"/**: {{ros__parameters: {{{given['config']}}}}}")
@@ -164,9 +124,8 @@ def test_experts_have_the_range_of_the_detectors(detectors, given, expected, lau
     assert (last.get("range") if isinstance(last, dict) else None) == expected
 
 
-def test_ground_and_cluster_file_rejects_other_arguments(launched, tmp_path):
-    """That of the first detector, of the one that is named, or one of the user's."""
-    _, nodes = launched("detectors")
+def test_experts_choose_the_file_of_ground_and_clusters(launched, tmp_path):
+    nodes = launched("detectors")
     mine = tmp_path / "mine.yaml"
     mine.write_text("")
     for detectors, experts, stem, words in (
@@ -185,22 +144,22 @@ def test_ground_and_cluster_file_rejects_other_arguments(launched, tmp_path):
                    if name != "candidates")
         assert all((str(mine) in started[name].parameters) == (experts == str(mine))
                    for name in ("ground_segmentation", "clustering"))
-        assert len(nodes.said) == len(words)
-        assert all(word in line for word, line in zip(words, nodes.said, strict=True))
+        assert len(nodes.messages) == len(words)
+        assert all(word in line for word, line in zip(words, nodes.messages, strict=True))
     mine.write_text("/**: {ros__parameters: {ground: {method: patchwork}}}")
     started = nodes(detectors="pointnet,pointpillars", config=str(mine), experts="pointpillars")
     assert started["pointnet_detector"].parameters[1] == str(mine)
     assert started["clustering"].parameters[0].endswith("pointpillars.param.yaml")
-    assert "ground.method" not in nodes.said[0]  # it is the same for both now
+    assert "ground.method" not in nodes.messages[0]  # which is equal for both
     nodes(single="true", experts="pointnet")
-    assert "has no effect" in nodes.said[0]
+    assert "has no effect" in nodes.messages[0]
 
 
 def test_arguments_override_user_file_and_defaults(launched, tmp_path):
-    """rcl prefers a section that names a node over /**, also an earlier one; ours are all /**."""
+    """rcl prefers a section that names a node to /**, which is the only section of our files."""
     for file in (ROOT / "config").glob("*.param.yaml"):
         assert list(read_sections(file)) == ["/**"]
-    _, nodes = launched("fused")
+    nodes = launched("fused")
     mine = tmp_path / "mine.yaml"
     mine.write_text("/**/fused_detector: {ros__parameters: {fused: {range: ahead}}}\n"
                     "left: {clustering: {ros__parameters: {clustering.density: 1.0}}}\n")
@@ -211,7 +170,7 @@ def test_arguments_override_user_file_and_defaults(launched, tmp_path):
     assert read_sections(above) == {"/**/fused_detector": given} == {
         "/**/fused_detector": {"fused.range": "around"}}
     assert started["clustering"].parameters[1:] == files[1:]
-    assert nodes.said == []
+    assert nodes.messages == []
 
 
 @pytest.mark.parametrize("section, words", [
@@ -220,12 +179,12 @@ def test_arguments_override_user_file_and_defaults(launched, tmp_path):
     ("controller_server", "is called 'controller_server', so its parameters change nothing$"),
     ("/**", ""), ("/*", ""), ("/left/**", ""), ("/**/clustering", ""), ("left/fused_detector", ""),
     ("front_fused_detector", ""), ("perception", "")])  # ours, in another graph
-def test_section_that_no_node_takes_is_a_warning(section, words, launched, tmp_path):
+def test_section_of_unknown_node_is_a_warning(section, words, launched, tmp_path):
     mine = tmp_path / "mine.yaml"
     mine.write_text(f"{section}:\n  ros__parameters: {{input.queue: 2}}\n")
-    _, nodes = launched("fused")
+    nodes = launched("fused")
     assert len(nodes(config=str(mine))) == 3
-    assert [bool(re.search(words, line)) for line in nodes.said] == [True] * bool(words)
+    assert [bool(re.search(words, line)) for line in nodes.messages] == [True] * bool(words)
 
 
 @pytest.mark.parametrize("name, given, words", [
@@ -234,29 +193,20 @@ def test_section_that_no_node_takes_is_a_warning(section, words, launched, tmp_p
     ("detectors", "zzz", "no launch argument 'zzz'; valid names: ahead, autostart"),
     ("replay", "real_tme", "did you mean 'real_time'"),
     ("replay", "namespace", "no launch argument 'namespace'"),
-    ("two_lidars", "lft", "did you mean 'left'"),
-    ("fused", "points", ""), ("fused", "launch-prefix", ""), ("two_lidars", "config", "")])
-def test_argument_that_a_launch_file_does_not_have_is_refused(name, given, words, description):
-    """ros2 launch, too, gives its arguments by an IncludeLaunchDescription."""
-    class Including(Recorded):
-        def execute(self):
-            return description(name)
-
-    sys.modules["launch.actions"].IncludeLaunchDescription = Including
-    actions = Including(launch_arguments=[(given, "1")]).execute()
-    first = next(a.function for a in actions if hasattr(a, "function"))
-    said = ""
-    try:
-        first(SimpleNamespace())  # with nothing that the work after the check needs
-    except InputError as error:
-        said = str(error)
-    except AttributeError:
-        pass
-    assert words in said and bool(words) == bool(said)
+    ("two_lidars", "lft", "did you mean 'left'")])
+def test_unknown_launch_argument_is_refused(name, given, words, launched, drive_bag):
+    with pytest.raises(InputError, match=re.escape(words)):
+        launched(name)(**{given: "1"}, **({"bag": str(drive_bag)} if name == "replay" else {}))
 
 
-def test_a_second_sensor_has_names_of_its_own(launched):
-    _, nodes = launched("detectors")
+@pytest.mark.parametrize("name, given", [
+    ("fused", "points"), ("fused", "launch-prefix"), ("two_lidars", "range")])
+def test_known_launch_argument_is_accepted(name, given, launched):
+    assert launched(name)(**{given: "auto"})
+
+
+def test_second_sensor_has_its_own_names(launched):
+    nodes = launched("detectors")
     for node in nodes(namespace="left").values():
         assert node.namespace == "left"
         assert not any(topic.startswith("/") for _, topic in node.remappings)
@@ -267,8 +217,8 @@ def test_a_second_sensor_has_names_of_its_own(launched):
     assert ("~/input/points", "points") in started["ground_segmentation"].remappings
 
 
-def test_tracking_puts_a_tracker_behind_each_detector(launched):
-    _, nodes = launched("detectors")
+def test_tracking_adds_a_tracker_to_each_detector(launched):
+    nodes = launched("detectors")
     started = nodes(tracking="true", odometry="/odometry", points="/cloud", namespace="left",
                     name_prefix="a_", detectors=SEVERAL)
     trackers = {name: node for name, node in started.items() if node.executable == "tracker"}
@@ -287,7 +237,7 @@ def test_tracking_puts_a_tracker_behind_each_detector(launched):
 
 
 def test_tracking_in_one_process_is_a_parameter_of_the_detector(launched):
-    _, nodes = launched("detectors")
+    nodes = launched("detectors")
     for name, node in nodes(tracking="true", single="true").items():
         assert node.executable != "tracker" and node.parameters[1]["tracking.enabled"] is True
         assert "tracking.enabled" in find_node_parameters(name)
@@ -295,7 +245,7 @@ def test_tracking_in_one_process_is_a_parameter_of_the_detector(launched):
 
 
 def test_rviz_follows_the_names_of_the_graph(launched):
-    _, nodes = launched("detectors")
+    nodes = launched("detectors")
     assert "rviz2" not in nodes()
     plain = nodes(rviz="true", detectors=SEVERAL, points="/cloud", rviz_frame="base_link",
                   namespace="left")["rviz2"]
@@ -317,33 +267,40 @@ def test_rviz_follows_the_names_of_the_graph(launched):
 @pytest.mark.parametrize("name", ["pointpillars", "pointnet", "fused"])
 def test_weights_device_and_range_of_a_detector_are_arguments(name, launched):
     expected = {f"{name}.weights": "w.safetensors", f"{name}.device": "cpu"}
-    if name != "pointnet":  # it always sees all around
+    if name != "pointnet":  # its range is always all around
         expected[f"{name}.range"] = "around"
     for file, weights in (name, "w.safetensors"), ("detectors", f"{name}=w.safetensors"):
-        _, nodes = launched(file)
+        nodes = launched(file)
         started = nodes(weights=weights, device="cpu", range="around", detectors=name
                         if file == name else "pointnet,pointpillars,fused")
         assert started[f"{name}_detector"].parameters[1] == expected
 
 
-def test_replay_connects_player_nodes_and_evaluator(description, drive_bag):
-    """Also where the file that includes it, or the command line, has arguments of these names."""
-    actions = description("replay")
-    pipeline = dict(next(a.launch_arguments for a in actions if hasattr(a, "launch_arguments")))
-    assert pipeline["detectors"] == "candidates"
-    assert pipeline["config"][0].endswith("replay.param.yaml,")
-    assert pipeline["namespace"] == pipeline["name_prefix"] == ""
-    arguments = {a.args[0]: getattr(a, "default_value", "") for a in actions if a.args[1:] == ()
-                 and hasattr(a, "description")} | {"bag": str(drive_bag)}
-    started = next(a.function for a in actions if hasattr(a, "function"))(SimpleNamespace(
-        perform_substitution=lambda s: arguments[s.args[0]],
-        launch_configurations={**arguments, "namespace": "left", "detectors": "candidates"}))
-    assert [a.msg for a in started if hasattr(a, "msg")] == [
-        "namespace:=left is not an argument of replay.launch.py"]
-    player = next(n for n in started if getattr(n, "executable", "") == "bag_player")
-    found = "candidate_refinement/output/detections"
-    assert player.parameters[1]["follow"] == [found]
-    assert f"{found}:=2" in player.parameters[1]["wait_for"]  # the evaluator and the player
+@pytest.mark.parametrize("single", ["false", "true"])
+@pytest.mark.parametrize("detectors", ["candidates", "fused", "candidates,pointpillars"])
+def test_replay_connects_player_nodes_and_evaluator(detectors, single, launched, drive_bag):
+    """Also where the file that includes it has arguments of these names."""
+    nodes = launched("replay")
+    started = nodes(bag=str(drive_bag), detectors=detectors, single=single, scores="scores.json",
+                    processes="true")
+    names = detectors.split(",")
+    assert {*started} == {*build_graph(names, single == "true"), "bag_player", "evaluator"}
+    found = {name: f"{find_result_node(name, single == 'true')}/output/detections"
+             for name in names}
+    player, evaluator = started["bag_player"].parameters[-1], started["evaluator"].parameters[-1]
+    assert player["follow"] == [*found.values()]
+    assert {f"{topic}:=2" for topic in found.values()} < {*player["wait_for"]}  # evaluator, player
+    by_paper = names == ["candidates"]
+    assert evaluator["stages"] == (["stage1", "stage2", "final"] if by_paper else
+                                   ["final"] if len(names) == 1 else names)
+    assert evaluator.get("classes") == (["Pedestrian"] if by_paper else None)
+    remapped = dict(started["evaluator"].remappings)
+    assert set(found.values()) < {*remapped.values()}
+    assert ("~/input/camera_info" in remapped) != by_paper
+    for node in build_graph(names, single == "true"):
+        files = [Path(f).name for f in started[node].parameters if isinstance(f, str)]
+        assert "replay.param.yaml" in files
+        assert ("replay_candidates.param.yaml" in files) == ("candidates" in names)
 
 
 @pytest.mark.parametrize("given, words", [
@@ -354,14 +311,14 @@ def test_replay_connects_player_nodes_and_evaluator(description, drive_bag):
     ({"config": "all.yaml"}, "config: no such parameter file: all.yaml"),
     ({"experts": "pointnets"}, "pointnets is neither a parameter file nor a detector"),
 ])
-def test_what_cannot_be_started_is_refused_by_name(given, words, launched):
+def test_unusable_launch_argument_is_refused(given, words, launched):
     with pytest.raises(InputError, match=words):
-        launched("detectors")[1](**given)
+        launched("detectors")(**given)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "test/launch").glob("*.py")), ids=lambda p: p.stem)
-def test_what_the_launch_tests_import_of_ours_exists(path):
-    """They run only where launch_testing is."""
+def test_imports_of_the_launch_tests_exist(path):
+    """They run only where launch_testing is installed."""
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("lidar_perception"):

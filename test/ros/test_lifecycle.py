@@ -46,13 +46,13 @@ def peer(shared_peer):
 
 @pytest.fixture(scope="module")
 def later(tmp_path_factory):
-    """Where the weights of two nodes are to be."""
+    """Return the path where the test puts the weights of two nodes later."""
     return tmp_path_factory.mktemp("later") / "later.safetensors"
 
 
 @pytest.fixture(scope="module")
 def nodes(shared_processes, weights, later):
-    """All at once: with its weights, without, without and by itself, without their template."""
+    """Start all nodes: with weights, without, without and autostarted, and without a template."""
     values = DETECTOR.values(weights)
     driven = {**values, "autostart": False}
     shared_processes.start(NODE, {}, driven, "ready")
@@ -70,7 +70,7 @@ def state(peer, node):
 
 
 def change(peer, node, name):
-    """Whether the node has done a transition, and is where that leads."""
+    """Return True if the node has made a transition and is in the state that follows."""
     number = getattr(Transition, f"TRANSITION_{name.upper()}")
     request = ChangeState.Request(transition=Transition(id=number))
     done = peer.call(f"/{node}/change_state", ChangeState, request).success
@@ -85,8 +85,7 @@ def drive(peer, node, *names):
 
 @pytest.fixture
 def here(peer):
-    """Nodes in the test's own process, so that it sees what they hold; the middleware between them
-    and the peer is the same."""
+    """Return a function that makes nodes in this process, whose memory the test can inspect."""
     made = []
 
     def make(kind, values, remap):
@@ -106,14 +105,14 @@ def here(peer):
 
 
 def entities(node):
-    """How many of each kind a node has."""
+    """Count the publishers, subscriptions and so on of a node."""
     return {kind: len(list(getattr(node, kind))) for kind in (
         "publishers", "subscriptions", "timers", "guards", "services", "clients", "waitables")}
 
 
-def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
-    """Nothing is heard or said while it is not active; results are those of the offline detector
-    each time it is, on the newest cloud; a shutdown can be asked about afterwards."""
+def test_manager_drives_a_detector_through_all_states(nodes, peer, weights):
+    """An inactive node receives and publishes nothing; an active one gives the detections of the
+    newest cloud. The state is available after a shutdown."""
     node = f"ready/{NODE}"
     assert state(peer, node) == State.PRIMARY_STATE_UNCONFIGURED
     peer.wait(lambda: peer.get_value(node, "lifecycle") == "unconfigured", "its diagnostics")
@@ -144,7 +143,7 @@ def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
 
 
 def test_node_without_subscribers_reports_it(here, peer, monkeypatch):
-    """As one that was started again behind a manager's back; not one that was asked to rest."""
+    """A node that was restarted without its manager is reported, a deactivated one is not."""
     monkeypatch.setattr("lidar_perception.nodes.managed.MANAGER_TIMEOUT_S", 0.0)
     for kind, topic, sent in ((GroundSegmentation, "points", CLOUD),
                               (TrackerNode, "detections", MARKERS)):
@@ -162,7 +161,7 @@ def test_node_without_subscribers_reports_it(here, peer, monkeypatch):
         assert node.state == (OK, "not configured")
 
 
-def test_cleanup_leaves_nothing_of_the_network(here, peer, weights):
+def test_cleanup_frees_the_network(here, peer, weights):
     node = here(PointPillarsNode, {**DETECTOR.values(weights), "autostart": False}, REMAP)
     talker, found = peer.advertise("/in", CLOUD), peer.listen("/found", MARKERS)
     empty, names = entities(node), set(vars(node))
@@ -180,8 +179,8 @@ def test_cleanup_leaves_nothing_of_the_network(here, peer, weights):
         assert entities(node) == empty and set(vars(node)) == names
 
 
-def test_the_clock_of_a_simulation_goes_on_after_a_cleanup(here, peer):
-    """Whether it was set before the node was configured or since."""
+def test_simulated_clock_continues_after_cleanup(here, peer):
+    """use_sim_time may be set before or after the node is configured."""
     name, clock = "ground_segmentation", "rosgraph_msgs/msg/Clock"
     node, talker = here(GroundSegmentation, {}, {}), peer.advertise("/clock", clock)
     for second, sim_time in enumerate((False, True, True), start=1):
@@ -196,8 +195,7 @@ def test_the_clock_of_a_simulation_goes_on_after_a_cleanup(here, peer):
 
 
 def test_node_waits_for_missing_network_file(nodes, peer, later, weights):
-    """A manager is refused, and the reason is an ERROR; once the file is there it is not refused,
-    and a node that starts by itself takes it."""
+    """A manager is refused until the file exists; an autostarted node then loads it."""
     reason = f"there is no checkpoint {later}"
     driven, alone = f"waits/{NODE}", f"tries/{NODE}"
     for _ in range(2):
@@ -229,7 +227,7 @@ def test_missing_template_is_reported_at_configure(nodes, peer):
               "unconfigured_shutdown")
 
 
-def test_an_activation_that_fails_is_said_and_tried_again(here, peer, monkeypatch):
+def test_failed_activation_is_reported_and_retried(here, peer, monkeypatch):
     def refuse(reception):
         raise RuntimeError("no such policy")
     with monkeypatch.context() as broken:
@@ -244,7 +242,7 @@ def test_an_activation_that_fails_is_said_and_tried_again(here, peer, monkeypatc
 
 
 def test_waiting_clouds_are_dropped_without_counting_pause(here, peer, good_cloud):
-    """sent = frames + dropped + lost holds over a pause, for what is sent while active."""
+    """sent = frames + dropped + lost holds for clouds that are sent while the node is active."""
     node = here(GroundSegmentation, {"input.queue": 3}, {"~/input/points": "/in"})
     talker = peer.advertise("/in", CLOUD)
     peer.send(talker, good_cloud, lambda: node.counts["frames"], "a frame")

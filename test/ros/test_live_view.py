@@ -1,4 +1,4 @@
-"""view --live over real DDS: a bag player, a detector with tracks, and the page that looks on."""
+"""view --live over DDS: a bag player, a detector with tracks, and the page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from browsing import browsing
-from robot_messages import mounted, transforms
+from robot_messages import mount_pose, transforms
 
 from lidar_perception.nodes.graph import SINGLE
 from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, has_tf
@@ -28,8 +28,8 @@ MARKERS = "visualization_msgs/msg/MarkerArray"
 FOUND = "/perception/output/detections"
 
 
-class Looking:
-    """The command at work, asked over HTTP."""
+class LiveView:
+    """The running command, queried over HTTP."""
 
     def __init__(self, processes):
         self.processes = processes
@@ -51,18 +51,18 @@ class Looking:
 
 
 @pytest.fixture(scope="module")
-def looking(shared_processes, shared_peer):
-    made = Looking(shared_processes)
+def view(shared_processes, shared_peer):
+    made = LiveView(shared_processes)
     shared_peer.wait(lambda: made.url, "the address of the page")
     return made
 
 
 @pytest.fixture(scope="module")
-def heard(shared_processes, shared_peer, looking, drive_bag):
-    """What the detector published, of a bag that is played again and again."""
+def received(shared_processes, shared_peer, view, drive_bag):
+    """Return the messages of the detector while a bag is played in a loop."""
     shared_peer.wait(lambda: any("nobody publishes clouds" in line for line in
-                                 looking.json("api/drive")["status"]["lines"]), "a clear line")
-    assert looking.json("api/drive")["frames"] == []
+                                 view.json("api/drive")["status"]["lines"]), "a clear line")
+    assert view.json("api/drive")["frames"] == []
     arrays = shared_peer.listen(FOUND, MARKERS)
     for node, remap in SINGLE.items():
         shared_processes.start(node, remap, {"seed.source": "ground_truth", "view.enabled": False,
@@ -71,31 +71,31 @@ def heard(shared_processes, shared_peer, looking, drive_bag):
     return arrays
 
 
-def test_frames_hold_the_columns_and_boxes_that_are_published(looking, heard, shared_peer):
+def test_frames_have_the_published_columns_and_boxes(view, received, shared_peer):
     drive = None
 
     def complete():
         nonlocal drive
-        drive = looking.json("api/drive")
+        drive = view.json("api/drive")
         kinds = {t["kind"] for t in drive["status"]["topics"] if t["came"]}
         return kinds == {"detections", "tracks", "labels"} and len(drive["frames"]) >= 3 and (
             drive["status"]["clouds"]["topic"] == "/perception/output/points")
     shared_peer.wait(complete, "clouds with columns, detections, tracks and labels")
 
     def published(stamp_ns):
-        """Of a bag that is looped: a stamp comes again, with tracks that are not as old."""
-        return [to_detections(m) for m in map(from_marker_array, heard[-40:])
+        """Return the messages of a stamp; the looped bag repeats it with other tracks."""
+        return [to_detections(m) for m in map(from_marker_array, received[-40:])
                 if m.stamp_ns == stamp_ns]
 
     def compared():
-        for frame in looking.json("api/drive")["frames"][-20:]:  # older ones are dropped soon
-            shown = looking.json(f"api/labels/{frame['frame']}")
+        for frame in view.json("api/drive")["frames"][-20:]:  # older ones are dropped soon
+            shown = view.json(f"api/labels/{frame['frame']}")
             rows = shown["detections"].get("perception")
             if rows and shown["labels"]:
-                body = looking.bytes(f"api/cloud/{frame['frame']}")
+                body = view.bytes(f"api/cloud/{frame['frame']}")
                 count = int(np.frombuffer(body, np.uint32, 1, 4)[0])
                 ground = np.frombuffer(body, np.uint8, count, 8 + 13 * count)
-                if ground.any():  # not one of the clouds shown while there were none with columns
+                if ground.any():  # not a cloud shown before the first with columns
                     found[:] = [np.array([[*row[:7], row[8]] for row in rows]), frame["stamp_ns"],
                                 ground, np.frombuffer(body, np.uint32, count,
                                                       len(body) - 4 * count)]
@@ -104,20 +104,20 @@ def test_frames_hold_the_columns_and_boxes_that_are_published(looking, heard, sh
     shared_peer.wait(compared, "a frame with columns, detections and labels")
     shown, stamp_ns, ground, clusters = found
 
-    def as_published():  # the page may have heard it a moment before this listener
+    def as_published():  # the page may receive it before this listener
         expected = [np.column_stack([d.boxes, d.scores]) for d in published(stamp_ns)]
         return any(shown.shape == e.shape and np.allclose(shown, e, atol=1e-6) for e in expected)
     shared_peer.wait(as_published, f"detections as shown, {shown}")
     assert 0.2 < ground.mean() < 1 and clusters.max() >= 1 and not clusters[ground == 1].any()
-    tracks = looking.json("api/state")["tracks"]
+    tracks = view.json("api/state")["tracks"]
     assert any(len(t["boxes"]) > 1 and t["trails"] for t in tracks)
 
 
-def test_the_newest_frame_appears_and_one_can_pause_and_step_back(looking, heard, shared_peer):
+def test_newest_frame_appears_and_replay_can_pause(view, received, shared_peer):
     with browsing() as browser:
         page = browser.new_page(viewport={"width": 1280, "height": 720})
         page.set_default_timeout(120_000)
-        page.goto(looking.url)
+        page.goto(view.url)
         page.wait_for_selector("html[data-ready=true]", state="attached")
         first = page.evaluate("page.store.frame")
         page.wait_for_function("n => page.store.frame > n + 3 && page.store.results.frame > n + 3",
@@ -127,7 +127,7 @@ def test_the_newest_frame_appears_and_one_can_pause_and_step_back(looking, heard
         page.wait_for_function("() => !page.store.playing"
                                " && page.store.wanted === page.store.frame")
         held = page.evaluate("page.store.frame")
-        page.wait_for_function("() => page.store.status.clouds.passed > 2")  # what comes is counted
+        page.wait_for_function("() => page.store.status.clouds.passed > 2")  # still counted
         page.keyboard.press(",")
         page.wait_for_function("n => page.store.frame === n - 1", arg=held)
         page.keyboard.press(" ")
@@ -135,23 +135,23 @@ def test_the_newest_frame_appears_and_one_can_pause_and_step_back(looking, heard
         assert page.locator("#errors .toast").count() == 0
 
 
-def test_boxes_in_another_frame_are_shown_where_tf_says(looking, heard, shared_peer):
-    """Those of the detector again, as a node publishes them whose target_frame is the robot's."""
-    talker, place = shared_peer.advertise("/robot/output/detections", MARKERS), mounted(
+def test_boxes_in_another_frame_are_shown_where_tf_says(view, received, shared_peer):
+    """The boxes of the detector, as a node with a target_frame publishes them."""
+    talker, place = shared_peer.advertise("/robot/output/detections", MARKERS), mount_pose(
         0.5, 0.2, 1.7, 0.0, 0.0, 0.3)
     sent = 0
 
     def send():
         nonlocal sent
-        if len(heard) > sent:
-            sent, found = len(heard), from_marker_array(heard[-1])
+        if len(received) > sent:
+            sent, found = len(received), from_marker_array(received[-1])
             talker.publish(encode(to_marker_array(
                 transform_boxes(found.boxes, place), found.labels, found.scores, make=bag_message,
                 header=make_header(found.stamp_ns, "base", bag_message))))
 
     def lines():
         send()
-        return looking.json("api/drive")["status"]["lines"]
+        return view.json("api/drive")["status"]["lines"]
     shared_peer.wait(lambda: any(
         "/robot/output/detections are not shown: TF does not connect 'base'" in line
         for line in lines()), "a line that names the frames")
@@ -163,8 +163,8 @@ def test_boxes_in_another_frame_are_shown_where_tf_says(looking, heard, shared_p
 
     def same():
         send()
-        for frame in looking.json("api/drive")["frames"][-20:]:
-            found = looking.json(f"api/labels/{frame['frame']}")["detections"]
+        for frame in view.json("api/drive")["frames"][-20:]:
+            found = view.json(f"api/labels/{frame['frame']}")["detections"]
             ours, theirs = (np.array([row[:7] for row in found.get(name, [])])
                             for name in ("robot", "perception"))
             if len(ours) and ours.shape == theirs.shape and np.allclose(ours, theirs, atol=1e-6):
@@ -173,6 +173,6 @@ def test_boxes_in_another_frame_are_shown_where_tf_says(looking, heard, shared_p
     shared_peer.wait(same, "boxes of both, in one place")
 
 
-def test_it_ends_cleanly_at_sigint(looking, heard, shared_processes):
+def test_it_ends_cleanly_at_sigint(view, received, shared_processes):
     assert shared_processes.end("view", 60.0) == 0
     assert "Traceback" not in shared_processes.read_log("view")

@@ -33,7 +33,7 @@ SIGNALS = signal.SIGINT, signal.SIGTERM
 
 
 def test_every_node_ends_with_code_0(processes, peer, tmp_path, drive_bag):
-    """At either signal, one node after the other; test_stopping.py has both in each phase."""
+    """SIGINT and SIGTERM in turn; test_stopping.py sends them in each phase."""
     arguments = {"bag_player": {"bag": str(drive_bag), "loop": True, "wait_timeout": 0.0},
                  "bag_recorder": {"bag": str(tmp_path / "bag"), "topics": ["/nothing"]}}
     for node in NODES:
@@ -41,7 +41,7 @@ def test_every_node_ends_with_code_0(processes, peer, tmp_path, drive_bag):
     peer.wait(lambda: set(NODES) <= set(peer.diagnostics), "all nodes")
     for i, process in enumerate(processes.running.values()):
         process.send_signal(SIGNALS[i % 2])
-    # Two seconds for each as a rule; where DDS hangs, stopping.py ends a node after 6.5.
+    # A node takes two seconds; if DDS hangs, stopping.py ends it after 6.5 seconds.
     peer.spin_until(lambda: all(map(processes.has_ended, NODES)), 15.0)
     assert {n: p.returncode for n, p in processes.running.items()} == dict.fromkeys(NODES, 0)
     logs = [*map(processes.read_log, NODES)]
@@ -88,7 +88,7 @@ def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
 
 @pytest.mark.parametrize("kind", [GroundSegmentation, Perception])
 def test_every_parameter_is_readable_and_lists_may_be_empty(start, kind):
-    """As ros2 param dump asks, and ros2 param set sets, where [] is a list of booleans."""
+    """`ros2 param dump` reads all parameters; `ros2 param set` sends [] as a list of booleans."""
     node = start(kind)
     declared = parameter_names(node)
     values = node.get_parameters(declared)
@@ -106,7 +106,7 @@ def test_every_parameter_is_readable_and_lists_may_be_empty(start, kind):
 
 
 def test_problem_with_changing_numbers_is_logged_once(start, monkeypatch):
-    """And that it is over, so that the log ends with how it is."""
+    """The end of the problem is logged too, so the log ends with the current state."""
     node, lines = start(GroundSegmentation), []
     monkeypatch.setattr(node, "_log", lambda level, message: lines.append((level, message)))
     for i in range(100):
@@ -124,7 +124,7 @@ ARGUMENTS = {"-p foo": "-p foo", "--params-file /nope.yaml": "/nope.yaml",
 
 
 def test_invalid_ros_arguments_exit_with_code_2(domain):
-    """The line names the node as ROS does."""
+    """The line has the logger name of the node."""
     program = '''
 import sys
 from time import sleep
@@ -147,7 +147,7 @@ for given in sys.argv[1:]:
 
 
 def test_parameter_that_a_node_does_not_have_is_named(start):
-    """rclpy says: undeclared parameter(s): []."""
+    """The message of rclpy would be: undeclared parameter(s): []."""
     node = start(GroundSegmentation)
     for name, words in (("input.queu", "no parameter 'input.queu'; did you mean 'input.queue'?"),
                         ("zzz", "/ground_segmentation has no parameter 'zzz'$")):
@@ -166,15 +166,15 @@ def test_bad_parameter_files_are_refused_in_one_line(processes):
 
 def test_missing_template_is_reported_with_first_cloud(perception, shared_peer,
                                                        talker, good_cloud):
-    """A diagnostic, as the file may appear."""
+    """It is a diagnostic, because the file may appear later."""
     peer = shared_peer
     with peer.parameters("/perception", {"seed.file": "/nowhere.json"}):
         peer.send(talker, good_cloud, lambda: "/nowhere.json" in peer.get_message("perception"),
                   "the diagnostic")
 
 
-def test_inputs_that_are_not_asked_for_change_nothing(perception, shared_peer, talker, good_cloud):
-    """A click while the seed is a file, and a CameraInfo without P while the crop is off."""
+def test_unused_inputs_change_nothing(perception, shared_peer, talker, good_cloud):
+    """A click while seed.source is file, and a CameraInfo without P while view is disabled."""
     peer, found = shared_peer, shared_peer.listen("/perception/output/detections", MARKERS)
     peer.send(talker, good_cloud, lambda: found, "candidates")
     first = from_marker_array(found[-1])
@@ -204,7 +204,7 @@ def test_old_markers_are_deleted_and_time_jumps_noticed(
 
 
 def test_restarted_bag_pairs_clouds_of_the_new_round():
-    """Whichever comes first after the jump, nothing of the round before is given out."""
+    """After the jump, no message of the round before is delivered."""
     for first in ("cloud", "partner"):
         delivered, dropped = [], []
         paired = StampMatcher(lambda c, p, d=delivered: d.append((c, p)), on_drop=dropped.append)
@@ -222,8 +222,8 @@ def test_restarted_bag_pairs_clouds_of_the_new_round():
 
 
 def test_clouds_wait_for_the_partner_with_their_stamp():
-    """Whatever the order of arrival, each cloud gets its own partner, in the order of the clouds;
-    one whose partner is lost gets none, and is not waited for for ever."""
+    """In any order of arrival, each cloud gets its own partner, in the order of the clouds; a cloud
+    whose partner is lost is delivered without one."""
     rng = np.random.default_rng(0)
     delivered = []
 

@@ -73,6 +73,9 @@ def test_silent_graph_is_awaited_once_then_briefly(monkeypatch):
         pace.wait_for_room(serve, lambda: False)
         pace.add_cloud(b"\0" * 4 + stamp(number))
     assert pace.unanswered == 4 and 8 + 3 < pace.held <= 8 + 3 + 4 * 0.25
+    held = pace.held
+    pace.wait_for_answers(serve, lambda: False)
+    assert pace.unanswered == 5 and not pace.waiting and pace.held == held
 
 
 def test_the_clouds_of_a_bag_are_found_or_those_it_has_are_named():

@@ -33,7 +33,7 @@ START, STEP = 10**18, 10**8
 
 @pytest.fixture(scope="module")
 def text_bag(tmp_path_factory):
-    """20 messages 'n' on /text every 0.1 s, 'latched' on /note at the start."""
+    """Write a bag: 20 messages 'n' on /text every 0.1 s, and 'latched' on /note at the start."""
     path = tmp_path_factory.mktemp("bag") / "texts"
     with BagWriter(path) as bag:
         bag.add_topic("/text", TEXT, SENSOR_QOS)
@@ -53,7 +53,7 @@ def start(processes, bag, **params):
 
 
 @pytest.mark.parametrize("ros", [2, 1])
-def test_bytes_arrive_as_they_are_in_the_bag(processes, peer, drive_bag, tmp_path, ros):
+def test_bytes_of_the_bag_arrive_unchanged(processes, peer, drive_bag, tmp_path, ros):
     played = drive_bag if ros == 2 else as_ros1(drive_bag, tmp_path / "drive.bag")
     with Bag(drive_bag) as bag:
         expected = {t: [d for topic, _, d in bag.raw_messages({t})] for t in (POINTS, TRUTH)}
@@ -65,7 +65,7 @@ def test_bytes_arrive_as_they_are_in_the_bag(processes, peer, drive_bag, tmp_pat
     peer.wait(lambda: all(len(received[t]) == len(expected[t]) for t in expected), "all messages")
     processes.check("bag_player")
     for topic, messages in expected.items():
-        # What pads the end of CDR may differ; the message may not.
+        # The padding at the end of CDR may differ, the message may not.
         assert all(a[:len(b)] == b[:len(a)] and abs(len(a) - len(b)) < 4
                    for a, b in zip(received[topic], messages))
     assert len(info) == 1 and info[0].width == 1242
@@ -95,7 +95,7 @@ def test_a_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
 
 def test_static_transforms_accumulate_others_keep_last(
         monkeypatch, start, tmp_path):
-    """Each node that publishes them sends its own, once."""
+    """Each of their publishers sends its own, once."""
     from lidar_perception.nodes.replay import bag_player
     monkeypatch.setattr(bag_player, "TF_MESSAGE", TEXT)  # which the wheels of ROS lack
     with BagWriter(tmp_path / "bag") as bag:
@@ -111,11 +111,11 @@ def test_static_transforms_accumulate_others_keep_last(
     assert [decode(d, TEXT).data for d in player.sent["tf_static"]] == [*map(str, range(20))]
     assert [decode(d, INFO).width for d in player.sent["info"]] == [19]
     depths = {o.topic_name: o.publisher.qos_profile.depth for o in player._outputs}
-    assert depths == {"/tf_static": 100, "/info": 10, "/text": 10}  # also for who comes late
+    assert depths == {"/tf_static": 100, "/info": 10, "/text": 10}  # for late subscribers, too
 
 
 def test_livox_and_compressed_clouds_are_played_as_point_clouds(start, tmp_path):
-    """A cloud that cannot be converted is left out; the others, and other topics, are played."""
+    """A cloud that cannot be converted is skipped; all other messages are played."""
     from lidar_perception.nodes.replay.bag_player import BagPlayer
     points = livox_points()
     plain = np.zeros(3, [(axis, "<f4") for axis in "xyz"])
@@ -141,7 +141,7 @@ def test_livox_and_compressed_clouds_are_played_as_point_clouds(start, tmp_path)
     assert (sent["draco"], texts(sent["text"]), player.counts["left_out"]) == ([], ["text"], 2)
 
 
-def test_a_wrong_metadata_is_a_warning_and_the_bag_is_played(start, text_bag, tmp_path, capfd):
+def test_bag_with_wrong_metadata_is_played_with_a_warning(start, text_bag, tmp_path, capfd):
     from lidar_perception.nodes.replay.bag_player import BagPlayer
     shutil.copytree(text_bag, tmp_path / "bag")
     metadata = yaml.safe_load((text_bag / "metadata.yaml").read_text())
@@ -172,7 +172,7 @@ def test_topic_of_several_publishers_offers_best_qos():
 
 def test_pause_step_resume_and_rate(processes, peer, text_bag):
     heard = peer.listen("/text", TEXT)
-    start(processes, text_bag, start_paused=True, rate=0.02)  # 85 s for what is left to the end
+    start(processes, text_bag, start_paused=True, rate=0.02)  # the rest takes 85 s
     request = Trigger.Request()
     for expected in (["0"], ["0", "1"], ["0", "1", "2"]):
         assert peer.call("/bag_player/step", Trigger, request).success
@@ -203,7 +203,7 @@ def test_bag_time_runs_at_the_rate_and_stands_still_while_paused(monkeypatch):
     assert player.now_ns == START + 11 * 10**9
 
 
-def test_the_clock_has_its_rate_where_messages_are_rare(monkeypatch):
+def test_clock_keeps_its_rate_between_rare_messages(monkeypatch):
     from lidar_perception.nodes.replay import bag_player
     from lidar_perception.params import PlayerParams
     player, now, sent = bag_player.BagPlayer.__new__(bag_player.BagPlayer), [50.0], []
@@ -219,12 +219,12 @@ def test_the_clock_has_its_rate_where_messages_are_rare(monkeypatch):
     assert 99 <= len(sent) <= 102
 
 
-def test_looping_starts_again_and_the_clock_follows_the_bag(processes, peer, text_bag):
+def test_clock_follows_a_looped_bag(processes, peer, text_bag):
     heard, clock = peer.listen("/text", TEXT), peer.listen("/clock", "rosgraph_msgs/msg/Clock")
     start(processes, text_bag, loop=True, rate=3.0, clock_hz=200.0)
     peer.wait(lambda: len(heard) > 45, "two and a half rounds")
     numbers = np.array(texts(heard), int)
-    again = np.flatnonzero(np.diff(numbers) < 0)  # a busy listener may miss some, but no round
+    again = np.flatnonzero(np.diff(numbers) < 0)  # a busy subscriber misses no round
     assert 2 <= len(again) <= 3 and (np.diff(numbers) != 0).all()
     assert (numbers[again] > 14).all() and (numbers[again + 1] < 5).all()
     times = np.array([to_ns(c.clock) for c in clock])
@@ -233,8 +233,8 @@ def test_looping_starts_again_and_the_clock_follows_the_bag(processes, peer, tex
     assert 1 <= back.sum() <= 3  # back to the start, once a round
 
 
-def test_it_waits_for_its_subscribers(processes, peer, text_bag):
-    start(processes, text_bag, wait_for=["/text:=2"], rate=1.0)  # ten are kept for whom is late
+def test_player_waits_for_subscribers(processes, peer, text_bag):
+    start(processes, text_bag, wait_for=["/text:=2"], rate=1.0)  # ten are kept for late subscribers
     first = peer.listen("/text", TEXT)
     peer.wait(lambda: peer.get_value("bag_player", "subscribers of /text") == "1", "one subscriber")
     assert first == []
@@ -242,9 +242,9 @@ def test_it_waits_for_its_subscribers(processes, peer, text_bag):
     peer.wait(lambda: len(first) == 20 and len(second) == 20, "all messages at both")
 
 
-def test_it_waits_until_a_node_of_ours_has_met_who_listens_to_it(processes, peer, text_bag):
-    """The player knows of a listener before the node that is listened to does: what that one
-    publishes meanwhile would be lost."""
+def test_player_waits_until_a_node_has_matched_its_subscriber(processes, peer, text_bag):
+    """The player discovers a subscriber before the publishing node does, whose messages until then
+    would be lost."""
     me = peer.node.get_name()
     between = f"/{me}/output/between"
     said = peer.advertise("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
@@ -282,7 +282,7 @@ BAD = {
 
 @pytest.fixture(scope="module")
 def refused(shared_processes, text_bag, drive_bag, tmp_path_factory):
-    """A player for each, in a namespace of its own, all at once; and the truncated bag."""
+    """Start one player for each case, each in its own namespace; return them and the cut bag."""
     cut = tmp_path_factory.mktemp("cut") / "texts"
     shutil.copytree(text_bag, cut)
     storage = next(cut.glob("*.mcap"))
@@ -294,17 +294,17 @@ def refused(shared_processes, text_bag, drive_bag, tmp_path_factory):
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_cannot_be_played_is_one_line_and_exit_code_2(refused, shared_processes, case):
+def test_unplayable_bag_is_one_line_and_exit_code_2(refused, shared_processes, case):
     assert shared_processes.running[f"{case}.bag_player"].wait(timeout=60) == 2
     log = shared_processes.read_log(f"{case}.bag_player")
     assert BAD[case][1] in log.splitlines()[-1] and "Traceback" not in log
     assert case != "truncated" or str(refused) in log
 
 
-def test_the_recorder_writes_what_the_player_plays(processes, peer, text_bag, tmp_path):
+def test_recorder_writes_the_played_messages(processes, peer, text_bag, tmp_path):
     processes.start("bag_recorder", {}, {"bag": str(tmp_path / "copy"), "compression": "lz4",
                                          "topics": ["/text", "/note"]})
-    start(processes, text_bag, rate=2.0)  # the player keeps ten for whom is late
+    start(processes, text_bag, rate=2.0)  # the player keeps ten for late subscribers
     peer.wait(lambda: processes.has_ended("bag_player")
               and peer.get_value("bag_recorder", "frames") == "21", "21 recorded messages")
     assert processes.stop()["bag_recorder"] == 0
@@ -329,7 +329,7 @@ def test_looped_single_message_bag_does_not_flood(
 
     def play():
         player.now_ns, player.anchor = START, now[0]
-        for late in range(200):  # as at a rate that nobody can keep
+        for late in range(200):  # as at a rate that is too high
             if not player._wait_until(START - late, "/text"):
                 return
             sent.append(now[0])

@@ -42,7 +42,7 @@ TEXT = "std_msgs/msg/String"
 
 @contextmanager
 def driver(peer, reliability, count, points=KITTI, first=1, hz=10):
-    """A process without a Fast DDS profile, until it has sent."""
+    """Run a process without a Fast DDS profile, which sends clouds."""
     environment = {k: v for k, v in os.environ.items() if k not in PROFILE_VARIABLES}
     process = subprocess.Popen(
         [sys.executable, Path(__file__).with_name("driver.py"), "/in", reliability,
@@ -57,10 +57,9 @@ def driver(peer, reliability, count, points=KITTI, first=1, hz=10):
     assert process.returncode == 0
 
 
-def test_an_ordinary_driver(processes, peer):
-    """RELIABLE loses nothing; of BEST_EFFORT, which comes later, most arrives where a socket may
-    hold a cloud, and what is lost is counted and said with a remedy; the end of it is an ERROR,
-    then STALE, then forgotten."""
+def test_clouds_of_a_driver_without_our_profile(processes, peer):
+    """A RELIABLE driver loses nothing. A BEST_EFFORT one loses little where a socket buffer holds a
+    cloud, and losses are reported with a remedy. Its end is an ERROR, then STALE."""
     def value(key):
         return int(peer.get_value(NODE, key) or 0)
 
@@ -103,8 +102,8 @@ def test_an_ordinary_driver(processes, peer):
     processes.check()
 
 
-def test_the_newest_cloud_wins_and_the_others_are_counted(processes, peer):
-    """A burst while a node works on a large cloud; a second publisher is said."""
+def test_newest_cloud_wins_and_others_are_counted(processes, peer):
+    """A burst arrives while a node processes a large cloud. A second publisher is reported."""
     processes.start(NODE, {"~/input/points": "/in"}, {"ground.method": "patchwork"})
     talker, rng = peer.advertise("/in", CLOUD), np.random.default_rng(0)
     large, *small = (encode(cloud(rng.uniform(-50, 50, (n, 3)) * [1, 1, 0.05], stamp))
@@ -138,7 +137,7 @@ def two_sensors(shared_processes):
 
 
 def test_two_sensors_in_namespaces(two_sensors, shared_peer):
-    """The same graph twice: no topic is shared, and the diagnostics tell which sensor it is."""
+    """Two equal graphs share no topic, and the diagnostics name the sensor."""
     peer = shared_peer
     talkers = {side: peer.advertise(f"/{side}/points", CLOUD) for side in SIDES}
     found = {side: peer.listen(f"/{side}/candidate_refinement/output/detections", MARKERS)
@@ -150,7 +149,7 @@ def test_two_sensors_in_namespaces(two_sensors, shared_peer):
         stamp = 5 * 10**9 * (i + 1)
         peer.send(talker, cloud(street, stamp), lambda s=side: found[s], f"the result of {side}")
         assert {to_ns(m.markers[0].header.stamp) for m in found[side]} == {stamp}
-        assert found[side][0].markers[0].lifetime.sec == 2  # and then a dead node's boxes go
+        assert found[side][0].markers[0].lifetime.sec == 2  # so the boxes of a dead node disappear
     own = {f"{side}/{node}": (side, f"{side}/lidar") for side in SIDES for node in STAGES}
     peer.wait(lambda: own.keys() <= peer.diagnostics.keys(), "diagnostics of all")
     assert all(peer.diagnostics[name].hardware_id in ids for name, ids in own.items())
@@ -162,7 +161,7 @@ def test_two_sensors_in_namespaces(two_sensors, shared_peer):
     two_sensors.check()
 
 
-def test_two_nodes_of_one_name_say_so(two_sensors, shared_peer, processes):
+def test_two_nodes_of_one_name_are_reported(two_sensors, shared_peer, processes):
     processes.start("clustering", {}, {}, namespace="left")
     shared_peer.wait_for_diagnostics("left/clustering", "another node is called /left/clustering",
                                      WARN)
@@ -173,7 +172,7 @@ def infos(numbers, period=10**8):
 
 
 def test_every_cloud_is_accounted_for():
-    """Whatever is lost, waits or is pushed out: sent = taken + dropped + lost."""
+    """sent = received + dropped + lost, in any mixture of losses and full queues."""
     rng = np.random.default_rng(0)
     for _ in range(100):
         arrivals, taken, number, sizes = Arrivals(5), 0, 0, []
@@ -184,14 +183,14 @@ def test_every_cloud_is_accounted_for():
             arrivals.add(infos(numbers.tolist()), len(numbers) - 1)
             taken += 1
             sizes.append(steps[0] - 1)
-        first = sizes[0]  # nobody knows how many came before the first
+        first = sizes[0]  # the number before the first is unknown
         assert arrivals.sent == number - first == taken + arrivals.dropped + arrivals.lost
         sent, lost, dropped = arrivals.count_recent()
         assert 0 <= lost + dropped < sent and sent >= WINDOW
         assert arrivals.learned == arrivals.measure_rate() == pytest.approx(10)
 
 
-def test_what_a_full_queue_has_pushed_out_was_not_lost_on_the_way():
+def test_cloud_dropped_from_full_queue_is_not_lost():
     arrivals = Arrivals(5)
     arrivals.add(infos([1]), 0)
     arrivals.add(infos([8, 9, 10, 11, 12]), 4)
@@ -210,7 +209,7 @@ def test_restarted_or_second_driver_loses_nothing():
     assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (1, 0, 8)
 
 
-def test_a_sensor_that_slows_down_is_seen_by_its_own_clock():
+def test_slower_sensor_is_detected_by_its_stamps():
     arrivals = Arrivals(5)
     for number in range(1, 30):
         arrivals.add(infos([number]), 0)
@@ -226,7 +225,7 @@ OVERRIDE = f"qos_overrides./{NODE}/input/points.subscription.reliability"
 @pytest.mark.parametrize("values, remedy", [
     ({}, ""), ({OVERRIDE: "best_effort"}, ""), ({OVERRIDE: "reliable"}, OVERRIDE),
     ({"input.reliability": "reliable"}, "input.reliability to auto")])
-def test_a_publisher_is_heard_or_it_is_said_with_the_remedy(start, monkeypatch, values, remedy):
+def test_incompatible_publisher_is_reported_with_remedy(start, monkeypatch, values, remedy):
     reception, = start(GroundSegmentation, **values)._receptions()
     for offered in ({RELIABLE}, {BEST_EFFORT}, {RELIABLE, BEST_EFFORT}):
         there = [SimpleNamespace(node_namespace="/", node_name=kind.name.lower(),
@@ -240,7 +239,7 @@ def test_a_publisher_is_heard_or_it_is_said_with_the_remedy(start, monkeypatch, 
         assert bool(said) == (remedy != "" and BEST_EFFORT in offered)
 
 
-def test_as_many_clouds_wait_at_the_middleware_as_may_wait(start):
+def test_middleware_queue_holds_input_queue_clouds(start):
     for queue, depth in (1, 5), (20, 20):
         reception, = start(GroundSegmentation, **{"input.queue": queue})._receptions()
         assert reception.subscription.qos_profile.depth == reception.arrivals.depth == depth
@@ -256,7 +255,7 @@ def test_unlatched_topic_error_names_the_remedy(peer, start):
               "the remedy")
 
 
-def test_who_has_lost_clouds_is_named_when_it_is_gone_as_before(start, monkeypatch):
+def test_source_of_losses_is_named_after_it_has_ended(start, monkeypatch):
     reception, = start(GroundSegmentation, **{"input.max_lost": 0})._receptions()
     driver = SimpleNamespace(node_namespace="/", node_name="driver", qos_profile=SimpleNamespace(
         reliability=BEST_EFFORT))
@@ -293,8 +292,10 @@ def test_problem_names_the_kind_of_publisher(monkeypatch, topic, what, publisher
 
 
 class Late:
-    """A Reception of clouds at 10 Hz, each of whose poses comes lag(stamp) seconds after it; in a
-    time that is made up. answered: (stamp, whether it had its pose)."""
+    """A Reception of clouds at 10 Hz in simulated time, whose poses come lag(stamp) seconds later.
+
+    answered: (stamp, True if the cloud had its pose) of each delivered cloud.
+    """
 
     def __init__(self, monkeypatch, lag, **params):
         self.now, self.lag, self.answered = 0.0, lag, []
@@ -344,7 +345,7 @@ def test_slow_sensor_is_not_reported_silent(
 
 
 @pytest.mark.parametrize("lag, rate", [(0.0, 10), (0.05, 10), (0.13, 10), (0.25, 4), (0.6, 1.6)])
-def test_however_late_poses_are_clouds_are_answered_with_theirs(monkeypatch, lag, rate):
+def test_clouds_get_their_own_late_poses(monkeypatch, lag, rate):
     late = Late(monkeypatch, lambda stamp: lag)
     late.run(30.0)
     assert all(known for _, known in late.answered)

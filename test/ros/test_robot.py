@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from robot_messages import PERIOD, START, WALKING, message, mounted, transforms, walker
+from robot_messages import PERIOD, START, WALKING, message, mount_pose, transforms, walker
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
@@ -32,9 +32,11 @@ def cloud(drive_bag):
         return next(m for _, _, m in bag.messages({POINTS}))
 
 
-def test_a_cropped_cloud_over_dds_is_the_cropped_frame_offline(processes, peer, cloud):
-    """Candidates equal those of the offline pipeline with the same parameters; what is cropped is
-    not in view. A parameter that was empty can be set while the node runs, with whole numbers."""
+def test_cropped_cloud_gives_the_offline_candidates(processes, peer, cloud):
+    """Candidates equal those of the offline pipeline, and cropped points are not in view.
+
+    An empty parameter can be set at run time, also with integers.
+    """
     values = {"crop.body": [-2, -1, -2, 3, 1, 1], "crop.min_range": 3.0,
               "crop.sectors": [60.0, 300.0], "crop.max_range": 40.0}
     params = with_values(PipelineParams(), values)
@@ -63,11 +65,12 @@ def test_a_cropped_cloud_over_dds_is_the_cropped_frame_offline(processes, peer, 
     peer.wait(lambda: "crop.* leaves none" in peer.get_message("ground_segmentation"), "the reason")
 
 
-def test_a_tilted_sensor_gets_its_mounting_from_tf(processes, peer):
-    """By /tf_static and /tf as others publish them: the network's boxes in odom are those of a
-    level sensor, moved as the robot has moved; the cloud waits for a transform that is late."""
+def test_tilted_sensor_gets_its_mount_from_tf(processes, peer):
+    """Boxes in odom are those of a level sensor, moved with the robot. The cloud waits for a late
+    transform."""
     pytest.importorskip("tf2_msgs", reason="the wheels of the pip environment lack tf2_msgs")
-    base, moved = mounted(0.5, 0.2, 1.7, 0.0, 0.3, -0.2), mounted(30.0, -4.0, 0.0, 0.0, 0.0, 0.0)
+    base = mount_pose(0.5, 0.2, 1.7, 0.0, 0.3, -0.2)
+    moved = mount_pose(30.0, -4.0, 0.0, 0.0, 0.0, 0.0)
     xyz, person = walker(base)
     processes.start("perception", {"~/input/points": "/in"}, {
         **WALKING, "base_frame": "base", "target_frame": "odom"})
@@ -91,4 +94,4 @@ def test_a_tilted_sensor_gets_its_mounting_from_tf(processes, peer):
     objects = from_marker_array(found[-1])
     assert (len(objects), objects.stamp_ns) == (1, START)
     np.testing.assert_allclose(objects.boxes[0, :2], at[:2], atol=0.3)
-    assert abs(objects.boxes[0, 2] - objects.boxes[0, 5] / 2) < 0.1  # it stands on the floor
+    assert abs(objects.boxes[0, 2] - objects.boxes[0, 5] / 2) < 0.1  # the box stands on the ground

@@ -15,7 +15,7 @@ from robot_messages import (
     WALKING,
     give,
     message,
-    mounted,
+    mount_pose,
     odometry,
     problems,
     transforms,
@@ -51,13 +51,13 @@ TILTS = {"nods": (0.4, 0.1, 1.9, 0.0, 0.35, 0.0), "leans": (-0.2, 0.5, 1.2, 0.3,
 
 
 @pytest.mark.parametrize("tilt", TILTS)
-def test_candidates_of_a_tilted_sensor_are_those_of_a_level_one(start, tilt):
-    """In the base's frame, from a click in yet another, without a number entered by hand."""
+def test_candidates_of_tilted_and_level_sensor_are_equal(start, tilt):
+    """The candidates are in the base frame, and the click in a third frame; TF has all mounts."""
     found = []
     x, y, height, yaw, *_ = TILTS[tilt]
-    for base in (mounted(x, y, height, yaw, 0.0, 0.0), mounted(*TILTS[tilt])):
+    for base in (mount_pose(x, y, height, yaw, 0.0, 0.0), mount_pose(*TILTS[tilt])):
         node = start(Perception, base_frame="base", target_frame="base", **WALKING)
-        camera = mounted(1.0, 0.0, 0.5, 1.0, 0.2, 0.1)
+        camera = mount_pose(1.0, 0.0, 0.5, 1.0, 0.2, 0.1)
         node.transforms.on_tf(transforms(("base", "lidar", base, 0), ("base", "eye", camera, 0)),
                               static=True)
         xyz, person = walker(base)
@@ -102,11 +102,13 @@ def weights(tmp_path_factory):
     return {k: v for k, v in flatten(params).items() if v != defaults[k]}
 
 
-def test_a_network_sees_a_tilted_sensors_cloud_as_a_level_ones(start, weights):
-    """Boxes in the base equal those of a level sensor at the same place and heading, and the same
-    boxes by parameters entered by hand; without a target they are in the cloud's frame."""
+def test_detections_of_tilted_and_level_sensor_are_equal(start, weights):
+    """Boxes in the base frame equal those of a level sensor, with the mount from TF or parameters.
+
+    Without target_frame they are in the frame of the cloud.
+    """
     scan = frame()
-    place = mounted(0.7, -0.3, 1.73, 0.2, 0.0, 0.0)
+    place = mount_pose(0.7, -0.3, 1.73, 0.2, 0.0, 0.0)
     tilt = make_tilted_pose(-0.2, 0.3)
     seen = transform_points(scan.xyz.astype(np.float64), invert_pose(tilt))
     level = start(PointPillarsNode, target_frame="base", **weights)
@@ -138,22 +140,21 @@ def test_a_network_sees_a_tilted_sensors_cloud_as_a_level_ones(start, weights):
 
 
 @pytest.mark.parametrize("by", ["hand", "TF", "nothing"])
-def test_the_detectors_look_ahead_wherever_x_of_the_clouds_looks(start, weights, by):
-    """Boxes of a sensor that is turned, and leans, are those of one that is not, in its frame; and
-    what is behind is cropped there, too."""
+def test_parameter_ahead_turns_the_view_of_the_detectors(start, weights, by):
+    """A turned and tilted sensor gives the boxes of a level one, and points behind are cropped."""
     scan, ahead = frame(), 150.0
     weights = {**weights, "crop.sectors": [100.0, 260.0]}
     plain = start(PointPillarsNode, **weights)
     give(plain, message(scan.xyz, intensity=scan.intensity))
     expected, _, _ = boxes_of(plain)
     tilt = np.eye(4) if by == "nothing" else make_tilted_pose(-0.2, 0.3)
-    level = invert_pose(mounted(0, 0, 0, np.radians(ahead), 0, 0)) @ tilt
+    level = invert_pose(mount_pose(0, 0, 0, np.radians(ahead), 0, 0)) @ tilt
     seen = transform_points(scan.xyz.astype(np.float64), invert_pose(level))
     leans = {"hand": {"ground.sensor_pose.roll": -0.2, "ground.sensor_pose.pitch": 0.3},
              "TF": {"base_frame": "base"}, "nothing": {}}[by]
     node = start(PointPillarsNode, **{**weights, **leans, "input.ahead": ahead})
     if by == "TF":
-        place = mounted(0.7, -0.3, 1.73, 1.0, 0.0, 0.0)  # where it looks in the base matters not
+        place = mount_pose(0.7, -0.3, 1.73, 1.0, 0.0, 0.0)  # its heading in the base has no effect
         node.transforms.on_tf(transforms(("base", "lidar", place @ tilt, 0)), static=True)
     give(node, message(seen, intensity=scan.intensity))
     found, frame_id, _ = boxes_of(node)
@@ -169,7 +170,7 @@ def test_the_detectors_look_ahead_wherever_x_of_the_clouds_looks(start, weights,
 
 
 def test_click_and_candidates_in_rotated_cloud(start):
-    turn = mounted(0, 0, 0, np.radians(-100), 0, 0)
+    turn = mount_pose(0, 0, 0, np.radians(-100), 0, 0)
     node = start(Perception, **WALKING, **{"input.ahead": -100.0})
     xyz, person = transform_points(walker_scene()[:, :3].astype(np.float64), turn), WALKER[:3]
     at = transform_points(np.array(person, np.float64)[None], turn)[0]
@@ -183,8 +184,8 @@ def test_click_and_candidates_in_rotated_cloud(start):
 
 
 def test_missing_frames_are_named_and_parameters_used(start):
-    """Columns and boxes are bit for bit those of a node that asks for no frame."""
-    xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
+    """Columns and boxes are bit for bit those of a node without frame parameters."""
+    xyz, _ = walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     plain = start(Perception)
     asks = start(Perception, base_frame="base_footprint", target_frame="odom")
     for node in plain, asks:
@@ -197,18 +198,18 @@ def test_missing_frames_are_named_and_parameters_used(start):
     assert "frame" not in problems(plain)
     asks.transforms.on_tf(transforms(
         ("odom", "base_footprint", np.eye(4), START),
-        ("base_footprint", "lidar", mounted(0, 0, -1.0, 0, 0, 0), START)), static=True)
+        ("base_footprint", "lidar", mount_pose(0, 0, -1.0, 0, 0, 0), START)), static=True)
     give(asks, message(xyz, START + 1))
     assert "-1.00 m above 'base_footprint', which must be on the ground" in problems(asks)
     assert "odom" not in problems(asks)
 
 
 def test_body_crop_needs_a_known_frame(start):
-    """Else it could be a person; and a body under the floor is said to be in another frame."""
+    """Otherwise it could be a person. A body below the ground is reported."""
     node = start(GroundSegmentation, base_frame="base", **{
         "crop.body": [-0.5, -0.4, 0.2, 0.5, 0.4, 1.0]})
     floor = np.random.default_rng(0).uniform(-20, 20, (2000, 3)) * [1, 1, 0]
-    sensor = mounted(0.5, 0.0, 1.2, 0.0, 0.0, 0.0)  # the base's origin is behind it
+    sensor = mount_pose(0.5, 0.0, 1.2, 0.0, 0.0, 0.0)  # the base's origin is behind it
     seen = transform_points(np.vstack([floor, [[0.3, 0.0, 0.8]], [[0.9, 0.0, 0.8]]]),
                             invert_pose(sensor))
     give(node, message(seen))
@@ -241,8 +242,8 @@ def test_unreadable_template_affects_candidates_only(start):
 
 
 def test_cloud_waits_for_late_or_missing_transform(start):
-    """Not for one that has stopped; nor where TF cannot be listened to."""
-    xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
+    """It does not wait for a transform that has stopped, nor without TF."""
+    xyz, _ = walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     node = start(Perception, target_frame="odom")
     deliver, msg = node._receptions()[0].deliver, encode(message(xyz))
     node.transforms.problem_by_source["TF"] = NO_TF
@@ -256,13 +257,13 @@ def test_cloud_waits_for_late_or_missing_transform(start):
     node.transforms.on_tf(transforms(("odom", "lidar", np.eye(4), START + PERIOD)), static=False)
     assert deliver(msg, True) is None and boxes_of(node)[1:] == ("odom", START)
     assert "odom" not in problems(node)
-    deliver(encode(message(xyz, START + 2 * PERIOD)), False)  # it has waited for long enough
+    deliver(encode(message(xyz, START + 2 * PERIOD)), False)  # the time to wait is over
     assert boxes_of(node)[1] == "lidar" and "0.100 s older than needed" in problems(node)
     assert deliver(encode(message(xyz, START + 20 * PERIOD)), True) is None  # odom has stopped
 
 
-def test_tracks_of_a_tilted_sensor_stay_in_the_clouds_frame(start, weights):
-    """Where its detections are in the base, its tracks are in the cloud."""
+def test_tracks_of_tilted_sensor_are_in_the_cloud_frame(start, weights):
+    """Tracks are in the frame of the cloud while detections are in that of the base."""
     scan, tilt = frame(), make_tilted_pose(-0.2, 0.3, 1.73)
     node = start(PointPillarsNode, **{**weights, "base_frame": "base", "target_frame": "base",
                                       "tracking.enabled": True, "tracking.report": 0.0})

@@ -24,7 +24,7 @@ from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES
     ("~/input/points:=/velodyne_points", 8 << 20, "fastdds_driver.xml"),
     ("~/input/points:=/velodyne_points", 212_992, "fastdds.xml"),
     ("~/input/points:=clustering/output/points", 8 << 20, "fastdds.xml")])
-def test_clouds_of_a_driver_come_by_udp_where_a_socket_holds_one(remap, buffer, profile,
+def test_driver_clouds_use_udp_if_the_socket_buffer_is_large(remap, buffer, profile,
                                                                  monkeypatch):
     monkeypatch.setattr(shared_memory, "read_socket_buffer_size", lambda: buffer)
     monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=1 << 20, f_frsize=4096))
@@ -34,33 +34,33 @@ def test_clouds_of_a_driver_come_by_udp_where_a_socket_holds_one(remap, buffer, 
     shared_memory.use_large_shared_memory(shared_memory.is_fed_by_driver(arguments))
     assert {Path(os.environ[name]).name for name in PROFILE_VARIABLES} == {profile}
     assert Path(os.environ[PROFILE_VARIABLES[0]]).is_file()
-    shared_memory.use_large_shared_memory(True)  # what is set stays
+    shared_memory.use_large_shared_memory(True)  # existing settings are kept
     assert Path(os.environ[PROFILE_VARIABLES[0]]).name == profile
 
 
 def segments(pid: int | str) -> set[Path]:
-    """Those that a process has open, its own and those of others in its domain."""
-    with suppress(OSError):  # it has ended, or is another user's
+    """Return the segments that a process has open: its own and others of its domain."""
+    with suppress(OSError):  # the process has ended, or belongs to another user
         maps = Path(f"/proc/{pid}/maps").read_text()
         return {Path(p) for p in re.findall(r"/dev/shm/fastrtps_[0-9a-f]{16}$", maps, re.M)}
     return set()
 
 
-def alone(process) -> bool:
-    """Whether nobody else has its segments open, nor it anybody else's."""
+def shares_no_segment(process) -> bool:
+    """Return True if a process shares no segment with another one."""
     return all(segments(process.pid).isdisjoint(segments(other.name))
                for other in Path("/proc").glob("[0-9]*") if other.name != str(process.pid))
 
 
 def short():
-    """A process alone in its domain."""
+    """Start a process shares_no_segment in its domain."""
     code = "import rclpy; rclpy.init(); node = rclpy.create_node('short'); print(); input()"
     while True:
         process = subprocess.Popen(
             [sys.executable, "-c", code], text=True, stdin=subprocess.PIPE,
             stdout=subprocess.PIPE, env={**os.environ, "ROS_DOMAIN_ID": str(reserve_domain())})
         process.stdout.readline()
-        if alone(process):
+        if shares_no_segment(process):
             return process
         process.communicate("\n")
 
@@ -70,7 +70,7 @@ def test_only_shared_memory_of_killed_process_is_removed(capsys):
         theirs, others = segments(killed.pid), segments(living.pid)
 
         def remove_as_if_old():
-            """And young again at once: every node that starts on this machine removes them, too."""
+            """Make the segments old during the call: other starting nodes would remove them."""
             for age in (0, 0), None:
                 for segment in theirs | others:
                     with suppress(FileNotFoundError):
@@ -84,7 +84,7 @@ def test_only_shared_memory_of_killed_process_is_removed(capsys):
         end = monotonic() + 10
         while (left := [s for s in theirs if s.exists() or Path(f"{s}_el").exists()]
                ) and monotonic() < end:
-            remove_as_if_old()  # another node that starts may hold their locks just now
+            remove_as_if_old()  # another starting node may hold their locks
         assert not left
         assert all(segment.exists() for segment in others)
         living.kill()

@@ -1,5 +1,4 @@
-"""What others take from the graph: RViz, Foxglove and a costmap find the topics that their files
-name, with that type, and a costmap finds the obstacles there."""
+"""Topics and types that the files for RViz, Foxglove and Nav2 expect exist in the graph."""
 
 from __future__ import annotations
 
@@ -52,15 +51,15 @@ RVIZ = {"rviz_default_plugins/PointCloud2": CLOUD, "rviz_default_plugins/MarkerA
 
 @pytest.fixture(scope="module")
 def graph(domain):
-    """topic -> type, and topic -> QoS of the publishers, of all nodes with the names that launch
-    files give their topics, what they listen to included."""
+    """Return {topic: type} and {topic: QoS of its publishers} of all nodes as launch files start
+    them."""
     context = create_context(domain)
     nodes, types, offered = [], {}, {}
     for name, remap in {**build_graph([*DETECTOR_NODES]), **SINGLE,
                         **build_graph(["candidates"], tracking=True)}.items():
         rules = [word for rule in remap.items() for word in ("-r", ":=".join(rule))]
         node = load_node_class(name)(context=context, cli_args=["--ros-args", *rules])
-        node.start()  # managed nodes have their topics then
+        node.start()  # which creates the topics of managed nodes
         nodes.append(node)
         types.update((t, kinds[0]) for t, kinds in node.get_subscriber_names_and_types_by_node(
             name, "/"))
@@ -108,7 +107,7 @@ def test_every_topic_of_the_foxglove_layout_is_in_the_graph(graph):
             assert types[panel["topicToRender"]] == "diagnostic_msgs/msg/DiagnosticArray"
 
 
-def test_both_show_the_same():
+def test_rviz_and_foxglove_show_the_same_topics():
     layout = json.loads((CONFIG / "foxglove_layout.json").read_text())["configById"]
     topics = next(p["topics"] for n, p in layout.items() if n.startswith("3D!"))
     displays = [d for d in rviz_manager()["Displays"] if "Topic" in d]
@@ -117,7 +116,7 @@ def test_both_show_the_same():
 
 
 def costmap_layers():
-    """(plugin, parameters) of each recipe in nav2.md."""
+    """Return (plugin, parameters) of each recipe in nav2.md."""
     for block in re.findall(r"```yaml\n(.*?)```", NAV2.read_text(), re.S):
         params = yaml.safe_load(block)["local_costmap"]["local_costmap"]["ros__parameters"]
         for name in params["plugins"]:
@@ -125,7 +124,7 @@ def costmap_layers():
                 yield params[name]["plugin"], params[name]
 
 
-def test_the_recipes_for_nav2_fit_what_is_published(graph):
+def test_nav2_recipes_match_the_published_obstacles(graph):
     types, offered = graph
     assert {plugin for plugin, _ in costmap_layers()} == set(LAYERS)
     for plugin, layer in costmap_layers():
@@ -141,7 +140,7 @@ def test_the_recipes_for_nav2_fit_what_is_published(graph):
 
 
 def test_a_costmap_gets_the_obstacles_of_each_cloud(processes, peer, drive_bag):
-    """From either node, with the header of the cloud, in the layout that Nav2 reads; as offline."""
+    """Obstacles of both nodes equal the offline ones, with the cloud's header and Nav2's layout."""
     with Bag(drive_bag) as bag:
         cloud = next(m for _, _, m in bag.messages({POINTS}))
     band = {"obstacles.min_height": 0.2, "obstacles.max_height": 2.5}

@@ -32,14 +32,14 @@ class Made:
     __del__ = lambda self: hang()
 class Refused:
     def __init__(self):
-        self.made = Made()  # as of a node whose parameters are bad
+        self.made = Made()  # as a node with invalid parameters does
         raise InputError("refused")
 sys.exit(_spin(Refused, ["node"], 0.0, stop))
 """
 
 
-# What hangs, the signal that comes then, the exit code and what is written. Of the signals none is
-# special (STOP_SIGNALS), so each case has one.
+# Case: the call that hangs, the signal, the exit code and the output. The signals are equivalent
+# (STOP_SIGNALS), so each case has one.
 CASES = {"work": (WORK_HANGS, signal.SIGINT, 0, ""),
          "teardown": (TEARDOWN_HANGS, signal.SIGTERM, 3, ""),
          "writing": (WRITES_LONG, signal.SIGTERM, 0, "written\n"),
@@ -50,7 +50,7 @@ if importlib.util.find_spec("rclpy"):
 
 @pytest.fixture(scope="module")
 def ended():
-    """case -> what it wrote and its exit code; all at once, as some take seconds."""
+    """Run all cases at the same time; return {case: (output, exit code)}."""
     running = {name: subprocess.Popen([sys.executable, "-c", PROGRAM.format(rest=rest)],
                                       text=True, stdout=subprocess.PIPE)
                for name, (rest, *_) in CASES.items()}
@@ -63,13 +63,13 @@ def ended():
 
 
 @pytest.mark.parametrize("name", list(CASES))
-def test_ends_whatever_hangs(ended, name):
+def test_node_ends_whatever_hangs(ended, name):
     _, _, code, output = CASES[name]
     assert ended[name] == (output, code)
 
 
 class Changing:
-    """A node that sees others leave at its first looks, or for ever."""
+    """A node in whose graph other nodes leave for some time, or for ever."""
 
     def __init__(self, looks):
         self.looks, self.destroyed = looks, None

@@ -48,14 +48,14 @@ def header(stamp, frame_id="lidar"):
 
 
 def poses_of(path):
-    """By stamp."""
+    """Return the poses of a bag by stamp."""
     with Bag(path) as bag:
         return {to_ns(m.header.stamp): read_pose(m.pose.pose)
                 for _, _, m in bag.messages({ODOMETRY})}
 
 
 def read(message):
-    """stamp, ids, Detections, velocities of an array of tracks."""
+    """Return stamp, ids, Detections and velocities of an array of tracks."""
     objects = from_marker_array(message)
     return (objects.stamp_ns, objects.ids.tolist(), to_detections(objects),
             [extra["velocity"] for extra in objects.extras])
@@ -73,8 +73,7 @@ def assert_same(message, tracks):
 
 @pytest.fixture(scope="module")
 def looped(domain, drive_bag, tmp_path_factory):
-    """What the graph says while a drive is played three times: the messages of each topic, those
-    of the same stamp in the order in which they came."""
+    """Play a drive three times; return {topic: {stamp: its messages in order}} of the graph."""
     params = with_values(BEST, {"seed.source": "automatic"})
     graph = build_graph(["candidates"], single=True, tracking=True)
     outputs = {"found": "/perception/output/detections", "behind": "/tracker/output/tracks",
@@ -88,7 +87,7 @@ def looped(domain, drive_bag, tmp_path_factory):
             extra = ({**flatten(params), "tracking.enabled": True, "input.queue": 2}
                      if node == "perception" else {})
             processes.start(node, {**remap, **ODOMETRY_INPUT}, {**extra, "ego.max_wait": 60.0})
-        listeners = {"found": 2, "behind": 1, "inside": 1}  # as each node itself sees them
+        listeners = {"found": 2, "behind": 1, "inside": 1}  # by the diagnostics of each node
         peer.wait(lambda: all(
             int(peer.get_value(topic.split("/")[1], f"subscribers of {topic}") or 0)
             >= listeners[name] for name, topic in outputs.items()), "the nodes to be connected")
@@ -106,8 +105,10 @@ def looped(domain, drive_bag, tmp_path_factory):
 
 
 def assert_tracked(frames, messages, poses, params):
-    """Messages are what the library answers to frames, MarkerArrays of detections. The Tracks of
-    each frame, None for those that are not answered."""
+    """Require that messages are the tracks of the library for frames, MarkerArrays of detections.
+
+    Return the Tracks of each frame, None without an answer.
+    """
     tracker, shown, messages = Tracker(params), [], iter(messages)
     for frame in map(from_marker_array, frames):
         tracks = tracker(to_detections(frame), frame.stamp_ns, poses.get(frame.stamp_ns))
@@ -131,7 +132,7 @@ def test_graph_tracks_equal_library_tracks_and_end_on_loop(looped, drive_bag):
     assert int(diagnostics["ended"]) > 0 and int(diagnostics["born"]) > 0
 
 
-def test_ids_stay_with_the_people_of_the_drive(looped, drive_bag):
+def test_ids_follow_the_people_of_the_drive(looped, drive_bag):
     clouds, heard, _ = looped
     with Bag(drive_bag) as bag:
         truth = {o.stamp_ns: to_truth(o) for o in
@@ -144,8 +145,8 @@ def test_ids_stay_with_the_people_of_the_drive(looped, drive_bag):
     assert people["switches"] == 0 and people["hits"] > clouds
 
 
-def test_in_one_process_with_the_detector_the_library_tracks_too(looped, drive_bag):
-    """Each cloud waits for its pose, as the frames of a tracker do."""
+def test_tracker_inside_the_detector_equals_the_library(looped, drive_bag):
+    """Each cloud waits for its pose, like the frames of a tracker node."""
     _, heard, _ = looped
     shown = assert_tracked(heard["found"], heard["inside"], poses_of(drive_bag),
                            TrackingParams())
@@ -160,7 +161,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
               and moving.get_subscription_count(), "the tracker")
 
     def send(message, words="tracking", answered=True):
-        """Publish once; wait for the tracks, if there are to be any, and for the reason."""
+        """Publish once; wait for the tracks, if any are expected, and for the reason."""
         shown = len(tracks)
         talker.publish(encode(message))
         peer.wait(lambda: words in peer.get_message(NODE) and len(tracks) >= shown + answered,
@@ -173,7 +174,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
         return make_detection_markers(found, header(now, frame_id), bag_message)
 
     def move(poses, child="lidar"):
-        """Poses of the next frames. Those of another child count when the first are silent."""
+        """Send poses of the next frames. A second child frame counts once the first is silent."""
         for i, at in enumerate(poses):
             stamp = now + (i + 1) * TENTH
             message = make_odometry(at, header(stamp, "odom"), child, bag_message)
@@ -208,7 +209,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
     send(frame(found), "first pose arrived")
     for i in range(1, 12):
         last = send(frame(cars(car(10 - 0.8 * i))))
-    assert np.abs(read(last)[3][0]).max() < 0.3  # what stands, stands
+    assert np.abs(read(last)[3][0]).max() < 0.3  # the object does not move
     arrows = {m.ns for m in last.markers if m.action == ADD}
     assert arrows == {"Car", "number", "trail"}
     now += 6 * TENTH
@@ -220,7 +221,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
 
 
 def test_detection_arrays_are_tracked_as_markers_are(start):
-    """By the node in this process, as vision_msgs is not everywhere."""
+    """The node runs in this process, because vision_msgs may be missing."""
     node, tracker = start(TrackerNode), Tracker()
     node.transforms.on_odometry(make_odometry(pose(50, 0, 1), header(START, "lidar"), "base",
                                               bag_message))  # detections are in its fixed frame

@@ -98,7 +98,7 @@ def make_detector(network: Network, header: Header, params: DetectorParams = Det
 
 def same(a: Detections | DetectionResult, b: Detections | DetectionResult,
          atol: float = 0.0) -> bool:
-    """Whether both say the same, in the same order."""
+    """Return True if both are equal, in the same order."""
     a, b = (x.detections if isinstance(x, DetectionResult) else x for x in (a, b))
     return (len(a) == len(b) and np.array_equal(a.class_ids, b.class_ids)
             and np.allclose(a.boxes, b.boxes, rtol=0, atol=atol)

@@ -105,7 +105,7 @@ def role_of_truth(o, kind, level):
 
 
 def role_of_detection(d, kind, level):
-    """'judge', 'may be used' or None: what is too low may be used, whatever it is called."""
+    """Return 'judge', 'may be used' (any class, below the minimum height) or None."""
     if d["bottom"] - d["top"] < LIMITS[level][0]:
         return "may be used"
     return "judge" if d["kind"] == kind else None
@@ -195,7 +195,7 @@ def sampled(scores, objects):
 
 
 def averages(values):
-    """Of 41 values, each replaced by the greatest from there on: at 11 and at 40 points."""
+    """Return the average of the envelope of 41 values, at 11 and at 40 points."""
     values = [max(values[k:]) for k in range(41)]
     return 100 * sum(values[0::4]) / 11, 100 * sum(values[1:]) / 40
 

@@ -67,7 +67,7 @@ def random_detector(params: PointNetDetectorParams | None = None,
 
 
 def blobs(rng, sizes, spread=0.4):
-    """Clusters of so many points, each around a place of its own."""
+    """Make clusters of the given numbers of points, each around its own centre."""
     middles = rng.uniform(-30, 30, (len(sizes), 3)) * [1, 1, 0.03]
     number = np.repeat(np.arange(len(sizes)), sizes)
     xyz = middles[number] + rng.normal(0, spread, (len(number), 3))

@@ -50,7 +50,7 @@ def odometry(pose, stamp, child="base", frame="odom"):
     return found
 
 
-def mounted(x, y, height, yaw, pitch, roll):
+def mount_pose(x, y, height, yaw, pitch, roll):
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
     pose[:3, 3] = x, y, height
@@ -62,7 +62,7 @@ def problems(node):
 
 
 def walker(base):
-    """The scene of samples.py on a floor at z = 0 of the base, as a sensor mounted there sees it;
-    and where its person is in the base."""
+    """Return walker_scene() on the floor of the base, in the frame of a sensor at pose `base`, and
+    the position of its person in the base."""
     on_floor = walker_scene()[:, :3].astype(np.float64) + [0, 0, 1.7]
     return transform_points(on_floor, invert_pose(base)), WALKER[:3] + [0, 0, 1.7]

@@ -23,13 +23,13 @@ def cloud(xyz, stamp=1, **changes):
     return msg
 
 
-def without_x():
+def make_cloud_without_x():
     msg = cloud(np.ones((5, 3)))
     msg.fields[0].name = "a"
     return msg
 
 
-def integer_z():
+def make_cloud_with_integer_z():
     msg = cloud(np.ones((5, 3)))
     msg.fields[2].datatype = 5
     return msg
@@ -40,14 +40,14 @@ def big_endian(xyz, stamp):
     return from_array(points, make_header(stamp, "lidar", bag_message), bag_message)
 
 
-BAD = {  # what is wrong -> message, words that the diagnostic must hold
+BAD = {  # defect -> message, words of the diagnostic
     "empty": (cloud(np.zeros((0, 3))), "no finite point"),
-    "missing x": (without_x(), "no field 'x'"),
+    "missing x": (make_cloud_without_x(), "no field 'x'"),
     "no fields at all": (bag_message(CLOUD), "no field 'x'"),
     "all NaN": (cloud(np.full((9, 3), np.nan)), "no finite point"),
     "cut": (cloud(np.ones((5, 3)), data=np.zeros(7, np.uint8)), "7 bytes"),
     "all infinite": (cloud(np.full((9, 3), np.inf)), "no finite point"),
-    "integer z": (integer_z(), "'z'"),
+    "integer z": (make_cloud_with_integer_z(), "'z'"),
     "more points than bytes": (cloud(np.ones((5, 3)), width=2**31), "bytes"),
     "point_step 0": (cloud(np.ones((5, 3)), point_step=0), "point_step"),
     "one point": (cloud([[5, 0, -1]]), "no ground"),

@@ -1,4 +1,4 @@
-"""Small made-up inputs that several test files share."""
+"""Small synthetic inputs that several test files share."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ each_make = pytest.mark.parametrize("make", [
         importlib.util.find_spec("rclpy") is None, reason="needs ROS 2, or the extra [ros]")),
 ])
 
-# Real scans that lie beside the checkout, never in it.
+# Real scans next to the checkout.
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="real data is not beside the checkout "
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="no real data next to the checkout "
                                 "(../shared/data)")
 
 STAMP = 1_700_000_000_123_456_789
@@ -161,7 +161,7 @@ def crowd(seed: int, people: int = 4) -> tuple[np.ndarray, GroundTruth]:
 
 
 def lowered_crowd(seed: int, by: float) -> Frame:
-    """The frame of a crowd as seen by a sensor so many metres lower; a tenth of a second a seed."""
+    """Return the frame of a crowd, seen by a sensor `by` metres lower, at 0.1 s times the seed."""
     cloud, truth = crowd(seed)
     up = np.array([0, 0, by], np.float32)
     scan = PointCloud.of(cloud[:, :3] + up, cloud[:, 3].copy(), 10**9 + seed * 10**8, "velodyne")
@@ -178,7 +178,7 @@ def crowd_folder(root: Path, count: int = 6) -> Path:
 
 
 def wait_for_the_end(group):
-    """Until no process of the group is left."""
+    """Wait until all processes of a group have ended."""
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
         try:

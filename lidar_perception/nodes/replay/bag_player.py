@@ -156,6 +156,7 @@ class BagPlayer(LidarNode):
                 break
             while not self.stop.done() and (left := begin + MIN_LOOP_S - monotonic()) > 0:
                 self.serve(timeout_sec=left)
+        self.pace.wait_for_answers(self._serve_answers, self.stop.done)
         self._count_pace()
         self.report(OK, "stopped" if self.stop.done() else "the bag is played")
         self._wait_until_delivered()
@@ -244,11 +245,13 @@ class BagPlayer(LidarNode):
         """Wait until the graph keeps up; the time of the bag stands still meanwhile."""
         if self.follows:
             self._advance()
-            self.pace.wait_for_room(lambda: self.serve(timeout_sec=ANSWER_POLL_S),
-                                    self.stop.done)
+            self.pace.wait_for_room(self._serve_answers, self.stop.done)
             self.anchor = monotonic()
         self.pace.add_cloud(cloud)
         self._count_pace()
+
+    def _serve_answers(self) -> None:
+        self.serve(timeout_sec=ANSWER_POLL_S)
 
     def _count_pace(self) -> None:
         if latencies := sorted(self.pace.latencies_ms):

@@ -1,27 +1,43 @@
-"""Node that scores detections against ground truth by the protocol of paper A."""
+"""Node that scores detections against ground truth: by centre distance while it runs, and by
+KITTI's average precision at its end."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
 from rclpy.qos import QoSProfile
 
+from lidar_perception.camera import Calibration
+from lidar_perception.classes import CAR, DETECTED
 from lidar_perception.nodes.reception import Problem
-from lidar_perception.nodes.runtime import ERROR, MARKERS, OK, WARN, LidarNode
+from lidar_perception.nodes.runtime import ERROR, LATCHED, MARKERS, OK, SENSOR_DATA, WARN, LidarNode
 from lidar_perception.params import EvaluatorParams
+from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.runs.files import write_text
 from lidar_perception.scoring.centres.report import CandidateReport, CandidateResult
-from lidar_perception.types import PEDESTRIAN, InputError
-from lidar_perception.wire.messages import to_detections, to_truth
+from lidar_perception.scoring.detections import FrameDetections
+from lidar_perception.scoring.kitti.camera_objects import select_in_image, to_scored_labels
+from lidar_perception.scoring.kitti.report import DetectionReport
+from lidar_perception.types import (
+    CLASSES,
+    PEDESTRIAN,
+    Detections,
+    GroundTruth,
+    InputError,
+    unknown_name,
+)
+from lidar_perception.wire.messages import read_calibration, to_detections, to_truth
 from msg_utils.markers import MarkedObjects, from_marker_array
 
 WRITE_PERIOD_S = 5.0
 MAX_INCOMPLETE_FRAMES = 100
 MAX_DONE_STAMPS = 100_000  # 2.8 hours at 10 Hz, 10 MB
+MAX_AP_FRAMES = 10_000     # kept for the average precision
 LOSSLESS_QOS = QoSProfile(depth=1000)  # small messages, none of which may be lost
 TRUTH = "ground_truth"
 
@@ -30,7 +46,8 @@ class Evaluator(LidarNode):
     """Scores each frame once its ground truth and the detections of all stages have arrived.
 
     Messages are matched by header.stamp. A frame counts once, even if its bag loops. Incomplete
-    frames count as lost, never as missed objects.
+    frames count as lost, never as missed objects. With a camera, labels and detections outside its
+    image are ignored, as KITTI has no labels there.
     """
 
     writes_files = True
@@ -39,14 +56,24 @@ class Evaluator(LidarNode):
         super().__init__("evaluator", EvaluatorParams(), **options)
         self.inputs_of_frame = (TRUTH, *self.params.stages)
         _check(self.params)
-        self.result = CandidateReport()
+        # Pedestrian first: its scores are at the top level of the file, those of others below.
+        self.results = {name: CandidateReport() for name in sorted(
+            self.params.classes, key=lambda name: name != CLASSES[PEDESTRIAN])}
+        self.precision = {stage: DetectionReport() for stage in self.params.stages}
+        self.camera_info: Any = None
+        self.extrinsics: Any = None
         self.waiting: dict[int, dict[str, MarkedObjects]] = {}
         self.done: dict[int, None] = {}  # stamps of scored and lost frames, in order
         self.unwritten: str | None = None  # reason why the file is not written
         self.frame_mismatch: str | None = None  # of the last frame
         self.counts.update(incomplete=0, repeated=0)
+        with lock_compilation(self.get_logger().info):
+            _warm_up()  # before the inputs, for which bag_player waits
         for name in self.inputs_of_frame:
             self.input(name, MARKERS, lambda m, n=name: self._add(n, m), LOSSLESS_QOS)
+        for topic, kind in (("camera_info", "sensor_msgs/msg/CameraInfo"),
+                            ("extrinsics", "geometry_msgs/msg/TransformStamped")):
+            self.input(topic, kind, partial(setattr, self, topic), LATCHED, SENSOR_DATA)
         for topic in self.params.timing:
             *_, node, _, what = topic.split("/")  # .../NODE/debug/WHAT
             name = node if what == "processing_time_ms" else what.removesuffix("_ms")
@@ -56,7 +83,7 @@ class Evaluator(LidarNode):
 
     def _add_time(self, name: str, ms: float) -> None:
         if isfinite(ms):
-            self.result.update_times({name: ms})
+            next(iter(self.results.values())).update_times({name: ms})
 
     def _add(self, name: str, msg: Any) -> None:
         objects = from_marker_array(msg)
@@ -73,7 +100,8 @@ class Evaluator(LidarNode):
             self._finish(stamp)
             with self.frame(stamp):
                 self._score(frame)
-            self.report(OK, "scoring" if self.result.frames else "no frame with a Pedestrian yet")
+            self.report(OK, "scoring" if any(result.frames for result in self.results.values())
+                        else "no frame with a Pedestrian yet")
         while len(self.waiting) > MAX_INCOMPLETE_FRAMES:
             oldest = next(iter(self.waiting))
             missing = [n for n in self.inputs_of_frame if n not in self.waiting[oldest]]
@@ -90,17 +118,38 @@ class Evaluator(LidarNode):
             del self.done[next(iter(self.done))]
 
     def _score(self, frame: dict[str, MarkedObjects]) -> None:
-        truth = to_truth(frame[TRUTH]).of_class(PEDESTRIAN)
-        if len(truth) or not self.params.only_with_pedestrians:
-            detections = {s: to_detections(frame[s]) for s in self.params.stages}
-            self.result.update(CandidateResult(truth, {s: d.boxes[d.class_ids == PEDESTRIAN]
-                                                       for s, d in detections.items()}, {}))
-        self.counts.update(scored=self.result.frames, **{
-            f"F1 of {s}": f"{score.make_rows()['all']['f1']:.3f}"
-            for s, score in self.result.scores.items()})
+        truth, calibration = to_truth(frame[TRUTH]), self._calibration()
+        stages = {s: to_scored_labels(to_detections(frame[s])) for s in self.params.stages}
+        visible_truth, visible = (truth, stages) if calibration is None else (
+            select_in_image(truth, calibration),
+            {s: select_in_image(objects, calibration) for s, objects in stages.items()})
+        for name, result in self.results.items():
+            self._score_class(name, result, visible_truth, visible)
+        for stage, objects in stages.items():
+            if len(self.precision[stage].frames) < MAX_AP_FRAMES:
+                self.precision[stage].update(FrameDetections(
+                    str(frame[TRUTH].stamp_ns), truth, objects, calibration))
         names = {name: objects.frame_id for name, objects in frame.items()}
         self.frame_mismatch = None if len({*names.values()}) == 1 else ", ".join(
             f"{self._topics([n])} in '{frame_id}'" for n, frame_id in names.items())
+
+    def _score_class(self, name: str, result: CandidateReport, truth: GroundTruth,
+                     stages: dict[str, GroundTruth]) -> None:
+        class_id = CLASSES.index(name)
+        suffix = "" if class_id == PEDESTRIAN else f", {name}"
+        boxes = truth.of_class(class_id)
+        if len(boxes) or suffix or not self.params.only_with_pedestrians:
+            result.update(CandidateResult(boxes, {
+                stage: objects.of_class(class_id) for stage, objects in stages.items()}, {}))
+        self.counts[f"scored{suffix}"] = result.frames
+        self.counts.update({f"F1 of {stage}{suffix}": f"{score.make_rows()['all']['f1']:.3f}"
+                            for stage, score in result.scores.items()})
+
+    def _calibration(self) -> Calibration | None:
+        """Return the calibration of the camera, or None before its messages have arrived."""
+        if self.camera_info is None or self.extrinsics is None:
+            return None
+        return read_calibration(self.camera_info, self.extrinsics)
 
     def _topics(self, names: Iterable[str]) -> str:
         return " and ".join(self.resolve_topic_name(f"~/input/{name}") for name in names)
@@ -131,18 +180,45 @@ class Evaluator(LidarNode):
     def write(self) -> None:
         """Write the scores so far to params.file, if it is set."""
         if self.params.file:
-            content = self.result.compute()
-            content["lost_frames"] = self.counts["incomplete"] + len(self.waiting)
-            try:
-                write_text(self.params.file, json.dumps(content, indent=1))
-                self.unwritten = None
-            except InputError as error:
-                self.unwritten = str(error)
+            self._write(self._content())
+
+    def _content(self) -> dict[str, Any]:
+        first, *others = self.results
+        return {**self.results[first].compute(),
+                "lost_frames": self.counts["incomplete"] + len(self.waiting),
+                "classes": {name: self.results[name].compute() for name in others}}
+
+    def _write(self, content: dict[str, Any]) -> None:
+        try:
+            write_text(self.params.file, json.dumps(content, indent=1))
+            self.unwritten = None
+        except InputError as error:
+            self.unwritten = str(error)
 
     def close(self) -> None:
-        self.write()
+        precision = {stage: {name: rows for name, rows in report.compute()["ap"].items()
+                             if name in self.results}
+                     for stage, report in self.precision.items()}
+        for name, result in self.results.items():
+            for stage, score in result.scores.items():
+                row, ap = score.make_rows()["all"], precision[stage].get(name, {})
+                bev = ap.get("bev_relaxed", {}).get("moderate")
+                self.get_logger().info(
+                    f"{name}, {stage}: {row['tp']} found, {row['fp']} false, {row['fn']} missed "
+                    f"within 1 m, F1 {100 * row['f1']:.1f}"
+                    + (f"; BEV AP {bev['r40']:.1f}" if bev else ""))
+        if self.params.file:
+            self._write({**self._content(), "ap": precision})
         if self.unwritten:
             raise InputError(f"the scores are lost: {self.unwritten}")
+
+
+def _warm_up() -> None:
+    """Score one object to trigger JIT compilation."""
+    truth = GroundTruth.of([[10, 0, 0, 4, 2, 1.5, 0]], [CAR])
+    report = DetectionReport()
+    report.update(FrameDetections("", truth, Detections.of(truth.boxes, truth.class_ids, [1.0])))
+    report.compute()
 
 
 def _check(params: EvaluatorParams) -> None:
@@ -150,6 +226,11 @@ def _check(params: EvaluatorParams) -> None:
     if TRUTH in params.stages or len({*params.stages}) < len(params.stages) or not params.stages:
         raise InputError(f"stages: {list(params.stages)} must be distinct names of inputs "
                          f"other than {TRUTH}")
+    if not params.classes:
+        raise InputError(f"classes: give one or more of {', '.join(DETECTED)}")
+    for name in params.classes:
+        if name not in DETECTED:
+            raise unknown_name("class", name, [*DETECTED])
     if short := [topic for topic in params.timing if topic.count("/") < 2]:
         raise InputError(f"timing: {short[0]} is not of the form .../NODE/debug/WHAT")
     if params.file and (Path(params.file).is_dir() or (

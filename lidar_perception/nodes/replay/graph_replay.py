@@ -26,6 +26,7 @@ from lidar_perception.nodes.graph import (
     list_result_topics,
     relative_name,
     reserve_domain,
+    runs_in_one_process,
 )
 from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.param_fields import flatten
@@ -43,7 +44,7 @@ SILENCE_TIMEOUT_S = 10.0  # without a result after the last cloud
 
 def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = "candidates",
            rate: float = 1.0, single: bool = False, real_time: bool = False,
-           processes: bool = True) -> dict:
+           processes: bool | None = None) -> dict:
     """Replay a bag through the graph of a detector and record the results.
 
     The nodes run on a private ROS domain. Logs and the result bag are left in `out`.
@@ -58,7 +59,8 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         single: run the detector in one process.
         real_time: send clouds at the rate of the sensor. Otherwise a cloud is sent once the clouds
             before it have detections, so that none is lost on a slow machine.
-        processes: start one process for each node; False: one for all nodes of the graph.
+        processes: start one process for each node; False: one for all nodes of the graph; None:
+            see runs_in_one_process().
 
     Returns:
         clouds, results (number of frames), latency_ms (median and p95 from sending a cloud to
@@ -94,7 +96,7 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         nodes["evaluator"] = configure_evaluator(scores.resolve(), single)
     recorded = [cloud_topic(single, detector), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
     nodes["bag_recorder"] = {}, {"bag": str((out / "result").resolve()), "topics": recorded}
-    one_process = not processes
+    one_process = runs_in_one_process(processes)
     with (Processes(out / "logs", domain) as running,
           GraphMonitor(domain, stages[FINAL]) as monitor):
         with running.together(GRAPH) if one_process else nullcontext():
@@ -112,7 +114,7 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         # Besides the graph, the tracker and the recorder may subscribe to the clouds; the recorder
         # also subscribes to the labels.
         cloud_subscribers = 1 + (poses == "kiss_icp") + (POINTS in recorded)
-        rules = list_awaited_topics(single, cloud_subscribers, 1 + 2 * scored, detector)
+        rules = list_awaited_topics([detector], single, cloud_subscribers, 1 + scored)
         # The detections have four subscribers: monitor, recorder, tracker, evaluator.
         rules += [f"{relative_name(stages[FINAL])}:={3 + scored}"]
         rules += [relative_name(ODOMETRY)] if poses == "recording" else []

@@ -86,3 +86,10 @@ class Pace:
                 break
             serve()
         self.held += monotonic() - begin
+
+    def wait_for_answers(self, serve: Callable[[], Any], is_stopped: Callable[[], bool]) -> None:
+        """Call serve() until no cloud waits, or is_stopped(); the time does not count as held."""
+        held, self.ahead = self.held, min(self.ahead, 1)
+        while self.ahead and self.waiting and not is_stopped():
+            self.wait_for_room(serve, is_stopped)
+        self.held = held
