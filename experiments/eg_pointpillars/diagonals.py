@@ -77,7 +77,8 @@ def _draw_histograms(records: list[dict[str, Any]]) -> Figure:
             share = 100 * counts / max(counts.sum(), 1)
             lines.append(Line(name, (BINS[:-1] + np.diff(BINS) / 2).tolist(), share.tolist()))
             low = paper.TABLE_2[name][0]
-            lines.append(Line(f"{name}, lower limit of Table 2", (low, low), (0.0, 100.0),
+            lines.append(Line(f"{name}, limit", (low, low), (0.0, 100.0),
                               dashed=True))
         panels.append(Panel(title, "diagonal in x-y [m]", "% of the class", tuple(lines)))
-    return Figure("figure_13", "Figure 13: diagonals by class", tuple(panels))
+    return Figure("figure_13", "Figure 13: diagonals by class, and the lower limits of Table 2",
+                  tuple(panels))

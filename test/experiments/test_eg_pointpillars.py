@@ -101,6 +101,7 @@ def test_report_has_values_of_the_paper_and_each_share():
         tables.make_sections([], models)  # of an unfinished run
         some = {name: m for name, m in models.items() if m.model.label_share == 1.0}
         tables.make_sections(records, some)
+    assert "long enough" not in sections[1].text
     by_name = {table.name: table for section in sections for table in section.tables}
     assert len(by_name["models"].rows) == 22
     first, *_, last = by_name["table_5"].rows
@@ -156,6 +157,7 @@ def test_tiny_run_from_training_to_pictures(tmp_path, monkeypatch):
     assert result.exit_code == 0, result.output
     report = json.loads((out / "report.json").read_text())
     assert report["measured"] == 2
+    assert "No version was trained long enough" in report["sections"][1]["text"]
     names = {t["name"] for section in report["sections"] for t in section["tables"]}
     assert names >= {"models", "table_5", "table_6", "table_2_clusters", "labels"}
     assert {p.name for p in (out / "figures").iterdir()} >= {"figure_13.png", "figure_20_1.png"}
