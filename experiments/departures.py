@@ -105,7 +105,7 @@ DEPARTURES = (
 
 KITTI, SIM = "KITTI object", "KITTI object, or `sim`"
 STM_CPA = "./lidar reproduce stm-cpa DATA --out DIR"
-EG = "./lidar reproduce eg-pointpillars --data DATA --out DIR"
+EG = "./lidar reproduce eg-pointpillars DATA --out DIR"
 CLUSTERS = "./lidar reproduce clusters DATA --out DIR"
 MEASURED = (
     Measured("A Table 1, 3 to 6, 8, 9", "pedestrians, stages, ranges, CPA steps, overlap, time",

@@ -78,9 +78,10 @@ def make_table_5(draws: Draws, frames: int) -> Section:
             "p values: samples of the frames, the same for all versions, so that the differences "
             "are paired. The paper does not say which recall points it uses.")
     best = max((values[0, RELAXED, MEAN] for values in draws.values()), default=np.nan)
-    if best < MIN_AP:
-        text = (f"No version was trained long enough to find objects (mean BEV AP {best:.1f}), so "
-                "neither the versions nor the study of labels can be compared. " + text)
+    if not best >= MIN_AP:  # or NaN
+        text = ("No version was trained long enough, or the frames have too few objects (mean BEV "
+                f"AP {best:.1f}), so neither the versions nor the study of labels can be compared. "
+                + text)
     return Section("Versions (Table 5)", text, tuple(tables))
 
 

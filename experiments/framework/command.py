@@ -90,7 +90,7 @@ def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out
       ./lidar reproduce stm-cpa-configurations /data/kitti/object --out configurations
       ./lidar reproduce clusters sim --budget 2 --out clusters
       ./lidar reproduce stm-cpa /nfs/kitti --out report --dask tcp://10.0.0.1:8786
-      ./lidar reproduce eg-pointpillars --data sim --budget 2 --out eg
+      ./lidar reproduce eg-pointpillars sim --budget 2 --out eg
     """
     name, data = _split_words(words, data)
     if dask and jobs:
