@@ -46,18 +46,28 @@ def export() -> None:
 @click.argument("weights", type=click.Path(path_type=Path), metavar="WEIGHTS")
 @out_file("--out", "File to write (.onnx).", required=True)
 def onnx(weights: Path, out: Path) -> None:
-    """Write a checkpoint of any version, size and classes as ONNX (needs the extra [onnx]).
+    """Write a checkpoint of PointPillars or PointNet as ONNX (needs the extra [onnx]).
 
-    The graph takes points sorted into pillars and gives the raw outputs at every anchor; its
-    metadata holds the rest. The detector takes the file instead of a checkpoint.
+    Any version, size and classes can be exported. The graph of PointPillars takes points sorted
+    into pillars and gives the raw outputs at every anchor; that of PointNet takes the points of
+    clusters. The metadata holds the rest. The detector takes the file instead of a checkpoint.
 
     \b
     Examples:
       lidar-perception export onnx v4.safetensors --out v4.onnx
+      lidar-perception export onnx pointnet/best.safetensors --out pointnet.onnx
     """
-    from lidar_perception.detectors.pointpillars.network import load_network
-    from lidar_perception.detectors.pointpillars.onnx import export_onnx
-    header, network = load_network(weights)
-    export_onnx(network.eval(), header, out)
-    config = header.config
-    console.print(f"{out}: {config.version} {config.size} for {', '.join(config.classes)}")
+    from lidar_perception.detectors.checkpoint import POINTNET, read_network_name
+    if read_network_name(weights) == POINTNET:
+        from lidar_perception.detectors.pointnet import onnx as pointnet
+        from lidar_perception.detectors.pointnet.network import load_pointnet
+        header, classifier = load_pointnet(weights)
+        pointnet.export_onnx(classifier, header, out)
+        title = f"PointNet {header.config.name}"
+    else:
+        from lidar_perception.detectors.pointpillars import onnx as pointpillars
+        from lidar_perception.detectors.pointpillars.network import load_network
+        header, network = load_network(weights)
+        pointpillars.export_onnx(network.eval(), header, out)
+        title = f"{header.config.version} {header.config.size}"
+    console.print(f"{out}: {title} for {', '.join(header.config.classes)}")

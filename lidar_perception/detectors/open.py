@@ -40,7 +40,8 @@ PARAMS = {
     POINTNET: "pointnet.params.PointNetDetectorParams",
     FUSED: "fused.params.FusedDetectorParams",
 }
-DETECTOR_BY_SUFFIX = {".onnx": POINTPILLARS, ".json": FUSED}  # of files that are not checkpoints
+ONNX = ".onnx"
+DETECTOR_BY_SUFFIX = {ONNX: POINTPILLARS, ".json": FUSED}  # of files that are not checkpoints
 
 
 class ConfigurableDetector(Detector, Protocol):
@@ -148,7 +149,11 @@ def _as_trained(params: Any, path: Path | None) -> Any:
     from lidar_perception.detectors.pointnet.config import PointNetConfig
     from lidar_perception.detectors.pointnet.weights_file import weights_file
     try:
-        config = read_header(path or weights_file(params.pointnet), PointNetConfig).config
+        if path is not None and path.suffix == ONNX:
+            from lidar_perception.detectors.onnx_file import read_exported_header
+            config = read_exported_header(path).config
+        else:
+            config = read_header(path or weights_file(params.pointnet), PointNetConfig).config
     except InputError:
         if path is not None:
             raise
@@ -174,6 +179,9 @@ def resolve_weights(weights: str | Path) -> tuple[str, Path | None]:
 
 def find_kind(path: Path) -> str:
     """Return the key in LOAD for a file of weights. InputError if it is not one."""
+    if path.suffix == ONNX and path.is_file():
+        from lidar_perception.detectors.onnx_file import read_exported_name
+        return read_exported_name(path)
     if path.suffix in DETECTOR_BY_SUFFIX:
         return DETECTOR_BY_SUFFIX[path.suffix]
     from lidar_perception.detectors.checkpoint import read_network_name

@@ -8,6 +8,8 @@ import os
 import struct
 import zipfile
 
+import numpy as np
+import pointnet_samples
 import pytest
 import torch
 from click.testing import CliRunner
@@ -20,6 +22,8 @@ from lidar_perception.detectors.checkpoint import (
     read_header,
     save_checkpoint,
 )
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.pointnet.detector import _load_network
 from lidar_perception.detectors.pointpillars import weights_file as weights_module
 from lidar_perception.detectors.pointpillars.config import NetworkConfig, make_config
 from lidar_perception.detectors.pointpillars.detector import load_detector
@@ -194,6 +198,31 @@ def test_export_reads_checkpoints_and_refuses_bad_files(saved, tmp_path, monkeyp
     for name, words in ("bad.onnx", "cannot read"), ("none.onnx", "no exported network"):
         with pytest.raises(InputError, match=words):
             load_detector(tmp_path / name, "cpu")
+
+
+@needs_onnx
+@pytest.mark.parametrize("name", ["improved", "farthest-ball-density", "pointnet"])
+def test_exported_pointnet_finds_the_same(tmp_path, name):
+    config = pointnet_samples.small(name)
+    network, clusters = pointnet_samples.lively(config), pointnet_samples.blobs(
+        np.random.default_rng(0), [1, 5, 30, 100, 7])
+    network.temperature.fill_(1.5)
+    network.offsets.copy_(torch.arange(4) / 10)
+    weights, out = tmp_path / "w.safetensors", tmp_path / "p.onnx"
+    save_checkpoint(weights, network, Header(config, {"steps": 3}))
+    done = CliRunner().invoke(cli, ["export", "onnx", str(weights), "--out", str(out)])
+    assert done.exit_code == 0 and f"PointNet {name}" in " ".join(done.output.split())
+    detector, wanted = (open_detector(file, "cpu", settings={
+        "pointnet.warm_up": False, "pointnet.engine": "torch"}) for file in (out, weights))
+    assert detector.params == wanted.params
+    assert detector.classifier.header == wanted.classifier.header
+    for count in (5, 1):
+        few = clusters.take(np.arange(count))
+        mine, theirs = (d.classifier.predict(few) for d in (detector, wanted))
+        np.testing.assert_allclose(mine.probabilities, theirs.probabilities, atol=1e-5)
+        np.testing.assert_allclose(mine.boxes, theirs.boxes, atol=1e-4)
+    with pytest.raises(InputError, match="runs on the CPU only"):
+        _load_network(out, "cuda", "auto")
 
 
 # weights of other projects

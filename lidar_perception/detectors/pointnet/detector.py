@@ -33,7 +33,7 @@ from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorPa
 from lidar_perception.detectors.pointnet.predict import Network, Predictions, select_detections
 from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.runs.threads import set_thread_count
-from lidar_perception.types import PointCloud
+from lidar_perception.types import InputError, PointCloud
 
 
 class PointNetDetector(NetworkDetector):
@@ -152,7 +152,7 @@ def load_pointnet_detector(path: str | Path = "", device: str = "auto",
     path = Path(path) if str(path) not in ("", ".") else weights_file(settings)
     if settings.threads:
         set_thread_count(settings.threads)
-    target = find_device(device)
+    target = CPU if path.suffix == ".onnx" and device == "auto" else find_device(device)
     header, network = _load_network(path, target, settings.engine)
     if params is None:
         params = PointNetDetectorParams(ground=header.config.ground,
@@ -166,7 +166,14 @@ def load_pointnet_detector(path: str | Path = "", device: str = "auto",
 
 
 def _load_network(path: Path, device: str, engine: str) -> tuple[Header, Network]:
-    """Load the network of a checkpoint; with torch only if no compiled kernels can run it."""
+    """Load a checkpoint, with torch only if no compiled kernels can run it; or an exported file."""
+    if path.suffix == ".onnx":
+        from lidar_perception.detectors.pointnet.onnx import OnnxPointNet
+        if device != CPU:
+            raise InputError(f"{path} runs on the CPU only, not on {device!r}; give the "
+                             "checkpoint, or the device cpu")
+        exported = OnnxPointNet(path)
+        return exported.header, exported
     if device == CPU and engine == "auto" and LANES:
         with suppress(WeightsMismatch):  # the torch path reports what does not fit
             header, tensors = read_arrays(path, PointNetConfig)

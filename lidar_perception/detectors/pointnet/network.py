@@ -80,7 +80,7 @@ def nearest(squared: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 def gather_rows(values: Tensor, indices: Tensor) -> Tensor:
     """Return the rows (B, M, k, C) of values (B, N, C) at indices (B, M, k)."""
-    first = torch.arange(len(values), device=values.device)[:, None, None] * values.shape[1]
+    first = torch.arange(values.shape[0], device=values.device)[:, None, None] * values.shape[1]
     rows = values.flatten(0, 1).index_select(0, (indices + first).flatten())
     return rows.view(*indices.shape, -1)
 

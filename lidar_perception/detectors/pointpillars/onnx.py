@@ -7,9 +7,7 @@ max (opset 18), which not every runtime has.
 
 from __future__ import annotations
 
-import logging
 import math
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidar_perception.detectors.checkpoint import KEY, Header
+from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.onnx_file import open_session, run_session, write_onnx
 from lidar_perception.detectors.pointpillars.config import BINS, CODE, NetworkConfig
 from lidar_perception.detectors.pointpillars.network import PointPillars, fuse_norms
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 from lidar_perception.detectors.pointpillars.prediction import Prediction
-from lidar_perception.runs.files import write_bytes
-from lidar_perception.runs.threads import thread_count
 from lidar_perception.types import InputError
 
-OPSET = 18
 COUNT = 100  # points of the example input
 OUTPUTS = ["logits", "codes", "directions"]
 
@@ -63,30 +59,14 @@ def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None
     Raises:
         InputError: the packages of the extra [onnx] are not installed.
     """
-    try:
-        import onnx
-        import onnxscript  # noqa: F401
-    except ImportError:
-        raise InputError("export onnx needs the packages of the extra [onnx]: pip install "
-                         "'lidar_perception[onnx]'") from None
     config = header.config
     inputs = {name: torch.zeros(shape, dtype=getattr(torch, kind))
               for name, (kind, shape) in _inputs(config).items()}
     inputs["cells"] += torch.arange(COUNT)
     dynamic = {name: None if name == "cluster_map" else
                {0: torch.export.Dim("points_in_range", min=1)} for name in inputs}
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is missing
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        program = torch.onnx.export(
-            OneCloud(fuse_norms(network), config.grid).eval(), tuple(inputs.values()), dynamo=True,
-            verbose=False, opset_version=OPSET, input_names=list(inputs), output_names=OUTPUTS,
-            dynamic_shapes=dynamic)
-    assert program is not None  # as dynamo is True
-    model = program.model_proto
-    onnx.helper.set_model_props(model, {KEY: header.to_json()})
-    onnx.checker.check_model(model)
-    write_bytes(path, model.SerializeToString())
+    write_onnx(path, OneCloud(fuse_norms(network), config.grid).eval(), header, inputs, OUTPUTS,
+               dynamic)
 
 
 class OnnxNetwork:
@@ -107,22 +87,7 @@ class OnnxNetwork:
         Raises:
             InputError: onnxruntime is not installed, or the file is missing or invalid.
         """
-        try:
-            import onnxruntime
-        except ImportError:
-            raise InputError(f"{path} needs onnxruntime: pip install 'lidar_perception[onnx]'"
-                             ) from None
-        if not Path(path).is_file():
-            raise InputError(f"there is no exported network {path}")
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = thread_count()
-        try:
-            session = onnxruntime.InferenceSession(str(path), options,
-                                                   providers=["CPUExecutionProvider"])
-            text = session.get_modelmeta().custom_metadata_map.get(KEY)
-        except Exception as error:  # its errors have no common base
-            reason = str(error).splitlines()[0]
-            raise InputError(f"ONNX Runtime cannot read {path}: {reason}") from None
+        session, text = open_session(path)
         header = Header.from_json(text, str(path), NetworkConfig)
         wanted = {name: (f"tensor({kind})", len(shape)) for name, (kind, shape) in
                   _inputs(header.config).items()}
@@ -138,13 +103,9 @@ class OnnxNetwork:
     def __call__(self, pillars: Pillars[np.ndarray], maps: np.ndarray | None) -> Prediction:
         given = dict(points=pillars.points, offsets=pillars.offsets, cells=pillars.cells,
                      cluster_map=maps)
-        try:
-            logits, codes, directions = self.session.run(
-                OUTPUTS, {name: value for name, value in given.items()
-                          if name in self.inputs and value is not None})
-        except Exception as error:  # its errors have no common base
-            raise InputError(f"ONNX Runtime cannot run {self.source}: "
-                             f"{str(error).splitlines()[0]}") from None
+        logits, codes, directions = run_session(self.session, self.source, OUTPUTS, {
+            name: value for name, value in given.items()
+            if name in self.inputs and value is not None})
         if [x.shape for x in (logits, codes, directions)] != self.shapes:
             raise InputError(f"the outputs of {self.source} have other shapes than a network of "
                              "its header; export it again")
