@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from lidar_perception.nodes.runtime import LidarNode
     from lidar_perception.nodes.stopping import Stop
 
-# In a process of several nodes, for a thread that comes back from compiled code and waits for the
-# interpreter lock. Python's default is 5 ms, as long as such code runs.
-SWITCH_INTERVAL_S = 0.0005
 STOP_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
 
 
@@ -145,7 +142,6 @@ def _spin_together(nodes: list[tuple[type, list[str]]], shared: list[str], begin
     """
     from lidar_perception.nodes.links import Links
     links = Links()
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
     return _run_nodes([(node_class, arguments, {"cli_args": arguments[1:], "links": links})
                        for node_class, arguments in nodes], shared, begin, stop)
 
@@ -212,7 +208,7 @@ def _run_nodes(given: list[tuple[type, list[str], dict[str, Any]]], shared: list
         stop.finish_closing(code)
         for node in nodes:
             node.destroy_node()
-        del kept  # shuts down DDS while the guard can still end a hang
+        del kept  # shuts down DDS, which may hang; then the guard ends the process
         rclpy.try_shutdown()
     return code
 
