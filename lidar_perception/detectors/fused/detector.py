@@ -123,17 +123,17 @@ class FusedDetector(NetworkDetector):
                cluster_ids: np.ndarray | None) -> DetectionResult:
         begin = perf_counter()
         wide = self._make_view(frame)
+        chosen = self
         if self.load_blind is not None and wide.frame.intensity is None:
-            return self.load_blind(self.range).with_params(self.params).detect(frame, ground,
-                                                                               cluster_ids)
+            chosen = self.load_blind(self.range).with_params(self.params)
         preprocess = perf_counter() - begin
-        proposals = self._propose(wide, ground, cluster_ids, self.settings.scores)
+        proposals = chosen._propose(wide, ground, cluster_ids, self.settings.scores)
         begin = perf_counter()
-        detections, best = self.decide(proposals)
+        detections, best = chosen.decide(proposals)
         detections = restore_detections(detections, self.params.ground.sensor_pose)
         timings = {STEPS[0]: preprocess * 1e3, **proposals.timings,
                    STEPS[-1]: (perf_counter() - begin) * 1e3}
-        return DetectionResult(detections, timings, proposals.problem or self.fallback, best)
+        return DetectionResult(detections, timings, proposals.problem or chosen.fallback, best)
 
     def _make_view(self, frame: PointCloud) -> NormalizedView:
         """Return the points in the range of the network, and up to MAX_RELIEF_M above or below."""
