@@ -133,6 +133,16 @@ def written(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
+def tiny_size(monkeypatch):
+    """The compact size of PointPillars has few channels and a coarse grid."""
+    from lidar_perception.detectors.pointpillars import config
+    monkeypatch.setitem(config.SIZES, "compact", dict(
+        low=(0.0, -20.48, -3.0), high=(40.96, 20.48, 1.0), cell=0.64, pillar_channels=8,
+        map_channels=(4, 8), block_channels=(8, 12, 16), block_layers=(1, 1, 1), deconv_channels=8,
+        fpn_channels=8))
+
+
+@pytest.fixture
 def tiny_sensor(monkeypatch):
     """Register the sensor of simulate_samples as a preset."""
     from simulate_samples import TINY

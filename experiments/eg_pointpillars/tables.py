@@ -46,7 +46,7 @@ def make_sections(records: list[dict[str, Any]], models: Mapping[str, TrainedMod
 
 
 def make_training_section(models: Mapping[str, TrainedModel]) -> Section:
-    """Return the statement of what was trained on what."""
+    """Return the table of networks with their training data and length."""
     rows: list[Row] = [
         (name, f"{100 * m.model.label_share:g} %", str(m.scenes), str(m.steps), str(m.best_step),
          f"{m.seconds / 60:.1f}", f"{m.parameters / 1e3:.1f}") for name, m in models.items()]

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
-from lidar_perception.data.frame import BOXES, CAMERA, Frame, Recording
+from lidar_perception.data.frame import BOXES, CAMERA, ComputedFrames, Frame, Recording
 from lidar_perception.data.open import open_recording
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.resuming import hash_names
@@ -142,8 +142,8 @@ def open_simulated(params: Any, folder: Path, count: int) -> Recording:
                      reopen=partial(open_simulated, params, folder, count), is_sequential=False)
 
 
-class TestFrames(Sequence[Frame]):
-    """Simulated frames, each of which is computed when its content is read."""
+class TestFrames(ComputedFrames):
+    """Simulated frames whose scans are computed when their content is read."""
 
     __test__ = False  # for pytest
 
@@ -153,16 +153,7 @@ class TestFrames(Sequence[Frame]):
     def __len__(self) -> int:
         return len(self.source)
 
-    @overload
-    def __getitem__(self, index: int) -> Frame: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Frame]: ...
-
-    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        number = range(len(self))[index]
+    def compute_frame(self, number: int) -> Frame:
         read = cache(partial(self.source.frame, number))
         scene, _ = self.source.locate(number)
         return Frame(f"scene {scene}", 0, lambda: read().load(), lambda: read().truth(),

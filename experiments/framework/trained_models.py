@@ -74,11 +74,11 @@ class TrainedModel:
 
 @dataclass(frozen=True)
 class ModelRequest:
-    """What to train and where.
+    """Request to train the models of an experiment.
 
     Attributes:
         models: models(params, seed) returns the models of a seed, in order of importance.
-        params: Training parameters that all models share, as far as the user gave any.
+        params: Training parameters of all models, with those given by the user.
         scenes: The scenes.
         out: Folder of the experiment.
         budget: Hours for everything; None: no limit, the parameters give the number of steps.

@@ -5,12 +5,13 @@ Files are read only when their content is used.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -108,6 +109,26 @@ def _identity(value: Any) -> Any:
 
 MAX_GAP_S = 2.0  # between two frames of a drive
 BOXES, POINT_LABELS, CAMERA, POSES = "labelled boxes", "labelled points", "a camera", "poses"
+
+
+class ComputedFrames(Sequence[Frame]):
+    """Frames that are computed when they are read, such as simulated ones."""
+
+    @abstractmethod
+    def compute_frame(self, number: int) -> Frame:
+        """Return the frame of a number from 0 to len(self) - 1."""
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Frame]: ...
+
+    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
+        numbers = range(len(self))[index]
+        if isinstance(numbers, range):
+            return [self.compute_frame(number) for number in numbers]
+        return self.compute_frame(numbers)
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,7 +98,7 @@ def read_exported_header(path: Path) -> Header:
 def read_exported_name(path: Path) -> str:
     """Return the name of the network of an exported file in checkpoint.NETWORKS.
 
-    A file without a readable header counts as PointPillars, whose loader tells what is wrong.
+    A file without a readable header counts as PointPillars, whose loader reports the error.
     """
     with suppress(InputError):
         return read_exported_header(path).network

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import overload
 
-from lidar_perception.data.frame import BOXES, CAMERA, POSES, Frame, Recording
+from lidar_perception.data.frame import BOXES, CAMERA, POSES, ComputedFrames, Frame, Recording
 from lidar_perception.simulation.camera import FORWARD_CAMERA, select_labels, select_labels_in_view
 from lidar_perception.simulation.drive import longest_drive, simulate_scan
 from lidar_perception.simulation.scene import ALL_STREETS, Scenes
@@ -16,7 +15,7 @@ from lidar_perception.simulation.sensor import HDL64E, Sensor
 DRIVE_GAP_NS = 10 * 10**9  # between the drives through two scenes, as between KITTI's recordings
 
 
-class SimulatedFrames(Sequence[Frame]):
+class SimulatedFrames(ComputedFrames):
     """Frames of simulated drives; each is computed when it is read.
 
     With a forward camera they have, as in KITTI, labels of the objects whose centre it sees. Where
@@ -34,16 +33,7 @@ class SimulatedFrames(Sequence[Frame]):
     def __len__(self) -> int:
         return self._frames
 
-    @overload
-    def __getitem__(self, index: int) -> Frame: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Frame]: ...
-
-    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        number = range(len(self))[index]
+    def compute_frame(self, number: int) -> Frame:
         camera, labels = ((FORWARD_CAMERA, select_labels_in_view) if self._has_camera else
                           (None, select_labels))
         scene, moment = divmod(number, self._per_drive)

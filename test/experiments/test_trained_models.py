@@ -15,7 +15,6 @@ from experiments.framework.experiment import Cell, Experiment, Section, Table
 from experiments.framework.scenes import ExperimentScenes
 from experiments.framework.trained_models import Model, ModelRequest, plan_training, train_models
 from lidar_perception.detectors.checkpoint import read_header
-from lidar_perception.detectors.pointpillars import config as config_module
 from lidar_perception.param_fields import with_values
 from lidar_perception.training.params import PointPillarsTraining
 from lidar_perception.types import InputError
@@ -23,15 +22,6 @@ from lidar_perception.types import InputError
 pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("one_thread", "streets", "tiny_size")]
 TINY = {"sensor": "generic:16,-20,5,2,10", "data.scans": 4, "data.val_scans": 1, "steps": 2,
         "batch": 1, "ahead": 10.0, "aside": 10.0, "augment.crowded": 0.0}
-
-
-@pytest.fixture
-def tiny_size(monkeypatch):
-    """Give the compact size few channels and a coarse grid."""
-    monkeypatch.setitem(config_module.SIZES, "compact", dict(
-        low=(0.0, -20.48, -3.0), high=(40.96, 20.48, 1.0), cell=0.64, pillar_channels=8,
-        map_channels=(4, 8), block_channels=(8, 12, 16), block_layers=(1, 1, 1), deconv_channels=8,
-        fpn_channels=8))
 
 
 def choose_models(params, seed):

@@ -38,7 +38,7 @@ sys.exit(_spin(Refused, ["node"], 0.0, stop))
 """
 
 
-# Case: the call that hangs, the signal, the exit code and the output. The signals are equivalent
+# By case: program, signal, exit code and output. The signals are equivalent
 # (STOP_SIGNALS), so each case has one.
 CASES = {"work": (WORK_HANGS, signal.SIGINT, 0, ""),
          "teardown": (TEARDOWN_HANGS, signal.SIGTERM, 3, ""),

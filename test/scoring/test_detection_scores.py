@@ -14,11 +14,6 @@ from samples import CALIBRATION
 
 from lidar_perception.data.kitti.labels import parse_label, to_ground_truth
 from lidar_perception.data.kitti.write import project_boxes
-from lidar_perception.scoring.average_precision import (
-    average_curve,
-    choose_thresholds,
-    sample_curve,
-)
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.scores import CentreScores
 from lidar_perception.scoring.detections import FrameDetections
@@ -375,27 +370,3 @@ def test_pedestrians_by_centre_distance_worked_out_by_hand():
     assert content["of_all"]["all"]["f1"] == 0.5
     assert content["best_score"] == pytest.approx(0.8)  # 2 * 1 / (1 + 2)
     assert content["at_best_score"]["all"]["f1"] == pytest.approx(2 / 3)
-
-
-@few
-@given(seeds, st.integers(41, 400))
-def test_thresholds_are_scores_of_hits_at_evenly_spaced_recall(seed, objects):
-    rng = np.random.default_rng(seed)
-    hits = rng.uniform(0, 1, rng.integers(1, objects + 1))
-    chosen = choose_thresholds(hits, objects)
-    assert len(chosen) <= 41 and (np.diff(chosen) < 0).all() and np.isin(chosen, hits).all()
-    recall = np.array([(hits >= t).sum() for t in chosen]) / objects
-    # Each is within half a step of its recall point; the last hit covers the remaining points.
-    np.testing.assert_allclose(recall[:-1], np.arange(len(chosen) - 1) / 40,
-                               atol=1 / objects + 1e-9)
-    assert chosen[-1] == hits.min()
-
-
-@pytest.mark.parametrize("objects", [1, 2, 7, 40, 41, 1000])
-def test_perfect_curve_averages_to_100_with_few_objects(objects):
-    thresholds = choose_thresholds(np.linspace(1, 0, objects), objects)
-    right = np.ones(len(thresholds))
-    assert average_curve(sample_curve(right, objects)) == pytest.approx((100, 100))
-    official = average_curve(sample_curve(right, objects, official=True))
-    assert official[1] == pytest.approx(100 * (min(objects, 41) - 1) / 40)
-    assert average_curve(sample_curve(np.zeros(0), objects)) == (0, 0)

@@ -13,7 +13,6 @@ from lidar_perception.cli.main import cli
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.checkpoint import read_header
-from lidar_perception.detectors.pointpillars import config as config_module
 from lidar_perception.detectors.pointpillars.detector import load_detector
 from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import find_sensor
@@ -24,15 +23,6 @@ from lidar_perception.types import InputError
 pytestmark = [pytest.mark.no_cover,  # covered by other tests
               pytest.mark.usefixtures("one_thread", "streets")]
 SENSOR = "generic:16,-20,5,2,10"
-
-
-@pytest.fixture
-def small(monkeypatch):
-    """Give the compact size few channels and a coarse grid."""
-    monkeypatch.setitem(config_module.SIZES, "compact", dict(
-        low=(0.0, -20.48, -3.0), high=(40.96, 20.48, 1.0), cell=0.64, pillar_channels=8,
-        map_channels=(4, 8), block_channels=(8, 12, 16), block_layers=(1, 1, 1), deconv_channels=8,
-        fpn_channels=8))
 
 
 def train(*arguments):
@@ -53,7 +43,7 @@ def sim(cache, out, **changes):
 
 
 def test_trained_network_opens_as_detector(
-        tmp_path, cache, small):
+        tmp_path, cache, tiny_size):
     out = tmp_path / "run"
     result = train(*sim(cache, out), "--version", "v4", "--seed", 5)
     assert result.exit_code == 0, result.output
@@ -86,7 +76,7 @@ def test_trained_network_opens_as_detector(
     assert read_header(tmp_path / "other/last.safetensors").config.high == header.config.high
 
 
-def test_kitti_and_simulated_scenes_mix_and_broken_ones_count(tmp_path, cache, small):
+def test_kitti_and_simulated_scenes_mix_and_broken_ones_count(tmp_path, cache, tiny_size):
     root = object_folder(tmp_path / "kitti", walker_label() + "\n", 6)
     write(root / "training/label_2/000002.txt", "Pedestrian 0 0 x\n")
     result = train(*sim(cache, tmp_path / "run"), "--data", root, "--version", "v0",
@@ -159,7 +149,7 @@ def test_training_and_validation_share_no_frame_by_any_path(tmp_path, monkeypatc
     (["--data", "sim", "--lr", "0"], "lr = 0"),
     (["--data", "sim", "--init", "missing.safetensors"], "missing.safetensors"),
 ])
-def test_bad_input_is_refused_at_once(tmp_path, small, arguments, reason):
+def test_bad_input_is_refused_at_once(tmp_path, tiny_size, arguments, reason):
     result = train(*arguments, "--out", tmp_path / "run", "--jobs", 0, "--data-scans", 1,
                    "--augment-cars", 0, "--augment-pedestrians", 0, "--augment-cyclists", 0,
                    "--augment-things", 0)
