@@ -63,12 +63,12 @@ def select_cloud_topic(types: Mapping[str, str], namespace: str = "", wanted: st
     if wanted:
         full = resolve_topic(wanted, namespace)
         if full not in clouds:
-            raise InputError(f"no node publishes clouds on {full}; there are clouds on "
+            raise InputError(f"nobody publishes clouds on {full}; there are clouds on "
                              f"{', '.join(clouds) or 'no topic'}")
         return full
     inside = [t for t in clouds if is_in_namespace(t, namespace)]
     if not inside:
-        raise InputError(f"no node publishes clouds{where}; is the graph running, on this "
+        raise InputError(f"nobody publishes clouds{where}; is the graph running, on this "
                          "ROS_DOMAIN_ID?" + (f" There are clouds on {', '.join(clouds)}"
                                              if clouds else ""))
     for end in CLOUD_ENDINGS:

@@ -53,7 +53,7 @@ INPUTS: dict[str, tuple[float, dict[str, str], list[dict[str, Any]]]] = {
             ("ground_truth", True, "stretched"), ("file", False, "stretched"),
             ("automatic", False, "metric"), ("click", False, "metric"))]),
     "tracker": (8, {"input/detections": MARKERS, "input/odometry": ODOMETRY_MESSAGE}, [{}]),
-    "evaluator": (8, {"input/ground_truth": MARKERS, "input/final": MARKERS}, [{}]),
+    "evaluator": (8, {"input/ground_truth": MARKERS, "input/final": MARKERS} | CAMERA, [{}]),
     "pointnet_detector": (0.5, POINTS, [{}]),
     "pointpillars_detector": (0.2, POINTS, [{}]),
     "fused_detector": (0.2, POINTS, [{}]),

@@ -324,6 +324,7 @@ def test_looped_single_message_bag_does_not_flood(
     player.params, player.awaited, player.clock = PlayerParams(loop=True), {}, None
     player.paused, player.steps, player.stop = False, 0, Future()
     player.served_at, player.report, player._count_pace = 0.0, lambda *_: None, lambda: None
+    player.pace = SimpleNamespace(wait_for_answers=lambda *_: None)
     player._wait_until_delivered = lambda: None
     monkeypatch.setattr(bag_player, "monotonic", lambda: now[0])
 
